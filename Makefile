@@ -1,0 +1,72 @@
+# One-line fronts to the `twirl` command and the development tools; `make help` lists them.
+# Every target first brings .venv up to date, so `make train TASK=biped` works on a fresh clone.
+
+.DEFAULT_GOAL := help
+TWIRL := .venv/bin/twirl
+PYTEST := .venv/bin/pytest
+CASE = $(if $(TASK),--task $(TASK)) $(if $(SHIFT),--shift $(SHIFT)) $(if $(SEED),--seed $(SEED))
+
+.PHONY: help setup bench-setup lint format test test-slow train evaluate collect sweep figures \
+	report render demo bench curriculum clean
+
+help: ## show this table
+	@echo 'usage: make TARGET [TASK=..] [SHIFT=..] [SEED=..] [RUN=..] [GRID=..] [ARGS=".."]'
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  %-12s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
+	@echo 'ARGS is handed on as it is: make train TASK=biped ARGS="--preset debug"'
+	@echo 'All options of a command: .venv/bin/twirl COMMAND --help'
+
+setup: ## make or refresh .venv (PYTHON=/path/to/python3.12, ACCEL=cpu|cuda12|cuda13|tpu)
+	@.ci/setup
+
+bench-setup: setup ## make or refresh .venv-bench, the environment of the SBX comparison
+	@.ci/setup bench
+
+lint: setup ## ruff check, ruff format --check, pyright
+	.venv/bin/ruff check .
+	.venv/bin/ruff format --check .
+	.venv/bin/pyright
+
+format: setup ## rewrite the code with ruff
+	.venv/bin/ruff check --fix .
+	.venv/bin/ruff format .
+
+test: setup ## the default tests, on the CPU (ARGS="tests/droq -x")
+	$(PYTEST) $(ARGS)
+
+test-slow: setup ## the learning curves and other long tests
+	$(PYTEST) -m "slow and not gpu" $(ARGS)
+
+train: setup ## train TASK= under SHIFT= with SEED= (ARGS="--preset debug --variant scratch")
+	$(TWIRL) train $(CASE) $(ARGS)
+
+evaluate: setup ## evaluate RUN=runs/NAME (several may be given)
+	$(TWIRL) evaluate $(RUN) $(ARGS)
+
+collect: setup ## record a source policy in TASK= as a dataset
+	$(TWIRL) collect $(CASE) $(ARGS)
+
+sweep: setup ## run what is missing of GRID= (a module of experiments/)
+	$(TWIRL) sweep $(GRID) $(ARGS)
+
+figures: setup ## rebuild all figures from the committed tables
+	$(TWIRL) figures $(ARGS)
+
+report: setup ## write the results as one HTML page
+	$(TWIRL) report $(ARGS)
+
+render: setup ## film RUN=runs/NAME as mp4 and a strip of frames
+	$(TWIRL) render $(RUN) $(ARGS)
+
+demo: setup ## render and evaluate the shipped policies; trains nothing
+	$(TWIRL) demo $(ARGS)
+
+bench: bench-setup ## measure this machine, beside SBX
+	$(TWIRL) bench $(ARGS)
+
+curriculum: setup ## train the chain of tasks one after another
+	$(TWIRL) curriculum $(CASE) $(ARGS)
+
+clean: ## remove caches and build products (keeps .venv and runs/)
+	rm -rf build dist .pytest_cache .ruff_cache
+	find . -path ./.venv -prune -o -path ./.venv-bench -prune -o -path ./runs -prune -o \
+		-name __pycache__ -type d -prune -exec rm -rf {} +
