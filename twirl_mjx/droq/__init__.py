@@ -1,0 +1,1 @@
+"""The learner: DroQ networks, losses and updates."""

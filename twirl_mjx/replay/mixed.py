@@ -1,0 +1,96 @@
+"""Source and online experience mixed in a fixed proportion, the core of TWiRL.
+
+Every minibatch of B rows holds exactly ``round(phi * B)`` source rows (paper Alg. 1, line 8), so
+phi is a property of each gradient and not only of their mean.
+"""
+
+from __future__ import annotations
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+
+from twirl_mjx.replay import ring as ring_lib
+from twirl_mjx.replay.ring import RingBuffer
+from twirl_mjx.types import Transition
+
+
+@flax.struct.dataclass
+class MixedReplay:
+    """Frozen source experience beside the growing online experience."""
+
+    source: RingBuffer | None
+    """Source transitions, never written; None when learning from scratch (phi 0)."""
+    online: RingBuffer
+    """Transitions gathered while training."""
+
+
+def source_rows(phi: float, batch_size: int) -> int:
+    """Return how many of the ``batch_size`` rows of a minibatch come from the source.
+
+    Raises:
+        ValueError: If ``phi`` is outside [0, 1] or ``batch_size`` is below 1.
+    """
+    if not 0.0 <= phi <= 1.0:
+        raise ValueError(f"phi is {phi}; it must lie in [0, 1] (nearest: {min(max(phi, 0), 1)})")
+    if batch_size < 1:
+        raise ValueError(f"batch_size is {batch_size}; it must be at least 1")
+    return round(phi * batch_size)
+
+
+def sample(
+    replay: MixedReplay, key: jax.Array, *, num_minibatches: int, batch_size: int, phi: float
+) -> Transition:
+    """Draw minibatches uniformly with replacement, source rows first.
+
+    A side that contributes no row (phi 0 or 1) is not read and may be empty. A side that does
+    contribute must hold at least one row; this is checked here only outside a traced function.
+
+    Args:
+        replay: Both rings.
+        key: Random key.
+        num_minibatches: U.
+        batch_size: B.
+        phi: Share of source rows, in [0, 1].
+
+    Returns:
+        Transitions [U, B, ...]; rows [:, :round(phi * B)] are from the source.
+
+    Raises:
+        ValueError: If a ring that must contribute is missing or known to be empty, or the rings
+            store rows of different sizes.
+    """
+    num_source = source_rows(phi, batch_size)
+    num_online = batch_size - num_source
+    source_key, online_key = jax.random.split(key)
+    blocks = []
+    if num_source:
+        if replay.source is None:
+            raise ValueError(
+                f"phi {phi} asks for {num_source} of {batch_size} rows from the source, but there "
+                "is no source ring; give one or set phi to 0"
+            )
+        _check_same_rows(replay.source, replay.online)
+        blocks.append(_draw(replay.source, source_key, (num_minibatches, num_source), "source"))
+    if num_online:
+        blocks.append(_draw(replay.online, online_key, (num_minibatches, num_online), "online"))
+    rows = blocks[0] if len(blocks) == 1 else jnp.concatenate(blocks, axis=1)
+    return ring_lib.unpack(rows, replay.online.obs_size, replay.online.action_size)
+
+
+def _draw(ring: RingBuffer, key: jax.Array, shape: tuple[int, int], name: str) -> jax.Array:
+    """Gather packed rows [*shape, W] uniformly from the filled part of a ring."""
+    if not isinstance(ring.size, jax.core.Tracer) and int(ring.size) < 1:
+        raise ValueError(f"cannot draw {shape[1]} rows per minibatch: the {name} ring is empty")
+    indices = jax.random.randint(key, shape, 0, ring.size, jnp.int32)
+    return ring_lib.gather_rows(ring, indices)
+
+
+def _check_same_rows(source: RingBuffer, online: RingBuffer) -> None:
+    """Raise ``ValueError`` when the two rings store transitions of different sizes."""
+    sizes = [(ring.obs_size, ring.action_size) for ring in (source, online)]
+    if sizes[0] != sizes[1]:
+        raise ValueError(
+            f"source rows have (obs, action) sizes {sizes[0]}, online rows {sizes[1]}; "
+            "the source must be recorded in the target task"
+        )
