@@ -1,0 +1,82 @@
+"""``import twirl_mjx`` is free of side effects: no device, no asset, no environment variable."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from twirl_mjx import assets
+
+# An audit hook sees every file that is opened. jax is allowed to be imported, not to start a
+# device: `backends_are_initialized` is what jax itself asks before it may change platforms.
+_PROBE = """
+import os, sys
+opened = []
+sys.addaudithook(lambda event, args: opened.append(str(args[0])) if event == "open" else None)
+before = dict(os.environ)
+{statement}
+changed = {{k for k in before.keys() | os.environ.keys() if before.get(k) != os.environ.get(k)}}
+data = [p for p in opened if "{marker}" in p.replace(os.sep, "/")]
+print("DATA", data)
+print("ENVIRONMENT", sorted(k for k in changed if k.startswith(("JAX", "XLA", "MUJOCO", "TWIRL"))))
+bridge = sys.modules.get("jax._src.xla_bridge")
+print("DEVICES", bool(bridge and bridge.backends_are_initialized()))
+"""
+
+
+def probe(statement: str, marker: str = "/assets/") -> str:
+    result = subprocess.run(
+        [sys.executable, "-c", _PROBE.format(statement=statement, marker=marker)],
+        env={**os.environ, "PYTHONPATH": str(Path(assets.__file__).parents[1])},
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    assert result.returncode == 0, result.stderr
+    return result.stdout
+
+
+def test_import_has_no_side_effects() -> None:
+    report = probe("import twirl_mjx")
+    assert "DATA []" in report
+    assert "ENVIRONMENT []" in report
+    assert "DEVICES False" in report
+
+
+def test_public_names_exist_without_starting_a_device() -> None:
+    report = probe("from twirl_mjx import make, load_policy, to_gymnasium, __version__")
+    assert "DATA []" in report
+    assert "DEVICES False" in report
+
+
+def test_the_probe_notices_side_effects() -> None:
+    readme = Path(__file__).resolve().as_posix()
+    report = probe(
+        f"open({readme!r}).close(); os.environ['XLA_FLAGS'] = ''; import jax; jax.devices()",
+        marker="test_import.py",
+    )
+    assert "test_import.py" in report
+    assert "ENVIRONMENT ['XLA_FLAGS']" in report
+    assert "DEVICES True" in report
+
+
+def test_asset_path_finds_the_model() -> None:
+    assert assets.asset_path("a1", "a1.xml").is_file()
+
+
+def test_asset_path_names_both_places() -> None:
+    with pytest.raises(FileNotFoundError) as error:
+        assets.asset_path("a1", "missing.xml")
+    for root in ("_assets", "assets"):
+        assert str(Path(root, "a1", "missing.xml")) in str(error.value)
+
+
+@pytest.mark.parametrize("bad", ["../pyproject.toml", "/etc/hostname"])
+def test_asset_path_stays_inside(bad: str) -> None:
+    with pytest.raises(ValueError, match="below the assets folder"):
+        assets.asset_path(bad)
