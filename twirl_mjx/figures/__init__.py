@@ -1,0 +1,1 @@
+"""Statistics, figures and the report: files in, files out, no simulator and no accelerator."""
