@@ -1,0 +1,233 @@
+"""Clips: sampling against scipy, cycle continuity, both file layouts, refusal of bad files."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation, Slerp
+
+from twirl_mjx.motion.clip import Clip, frame_velocities, sample, slerp
+from twirl_mjx.motion.formats import foot_paths, read_clip, write_clip
+from twirl_mjx.sim import a1
+
+SAMPLE = jax.jit(jax.vmap(sample, in_axes=(None, 0)))
+
+
+def make_clip(num_frames: int = 9, yaw_per_cycle: float = 0.0, **changes: Any) -> Clip:
+    """A smooth walk-like motion whose last frame is its first frame moved on."""
+    phase = np.linspace(0.0, 2 * np.pi, num_frames)
+    share = phase / (2 * np.pi)
+    angles = np.stack(
+        [yaw_per_cycle * share + 0.1 * np.sin(phase), 0.3 * np.sin(phase), 0.2 * np.sin(2 * phase)],
+        axis=1,
+    )
+    quat = Rotation.from_euler("ZYX", angles).as_quat(scalar_first=True)
+    pos = np.stack([1.0 + 0.8 * share, 0.2 + 0.1 * share, 0.3 + 0.03 * np.cos(phase)], axis=1)
+    swing = np.sin(phase[:, None] + np.arange(12))
+    clip = Clip(pos, quat, a1.DEFAULT_POSE + 0.2 * swing, frame_duration=0.05, name="walk")
+    return dataclasses.replace(clip, **changes)
+
+
+def test_sampling_agrees_with_scipy() -> None:
+    clip = make_clip()
+    times = np.linspace(0.0, clip.cycle_duration * 0.999, 57)
+    qpos, _ = SAMPLE(clip.to_arrays(), jnp.asarray(times, jnp.float32))
+    grid = np.arange(clip.num_frames) * clip.frame_duration
+    rotations = Rotation.from_quat(clip.root_quat, scalar_first=True)
+    expected = Slerp(grid, rotations)(times)
+    got = Rotation.from_quat(np.asarray(qpos[:, 3:7]), scalar_first=True)
+    assert (got * expected.inv()).magnitude().max() < 1e-5
+    for column in range(3):
+        want = np.interp(times, grid, clip.root_pos[:, column])
+        np.testing.assert_allclose(qpos[:, column], want, atol=2e-6)
+    for joint in range(12):
+        want = np.interp(times, grid, clip.joint_pos[:, joint])
+        np.testing.assert_allclose(qpos[:, 7 + joint], want, atol=2e-6)
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-6, 1e-3, 0.5, 3.0])
+def test_slerp_is_unit_and_even(angle: float) -> None:
+    a = Rotation.from_euler("xyz", [0.3, -0.2, 0.9])
+    b = a * Rotation.from_rotvec(angle * np.array([0.6, 0.0, 0.8]))
+    quats = [jnp.asarray(r.as_quat(scalar_first=True), jnp.float32) for r in (a, b)]
+    for sign in (1.0, -1.0):  # the other sign is the same rotation
+        out = np.asarray(slerp(quats[0], sign * quats[1], jnp.float32(0.25)))
+        turned = (a.inv() * Rotation.from_quat(out, scalar_first=True)).magnitude()
+        assert np.linalg.norm(out) == pytest.approx(1.0, abs=1e-6)
+        assert turned == pytest.approx(0.25 * angle, abs=2e-6)
+
+
+@pytest.mark.parametrize("yaw", [0.0, 0.7])
+def test_cycles_join_without_a_jump(yaw: float) -> None:
+    clip = make_clip(yaw_per_cycle=yaw, cycle_offset_rotation=yaw != 0.0)
+    duration, dt = clip.cycle_duration, 1e-4
+    ends = duration * np.array([-1.0, 1.0, 2.0, 5.0])
+    before, vel_before = SAMPLE(clip.to_arrays(), jnp.asarray(ends - dt, jnp.float32))
+    after, vel_after = SAMPLE(clip.to_arrays(), jnp.asarray(ends + dt, jnp.float32))
+    np.testing.assert_allclose(before[:, :3], after[:, :3], atol=2e-3)
+    np.testing.assert_allclose(before[:, 7:], after[:, 7:], atol=2e-3)
+    np.testing.assert_allclose(np.abs((before[:, 3:7] * after[:, 3:7]).sum(1)), 1.0, atol=1e-5)
+    np.testing.assert_allclose(vel_before, vel_after, atol=0.05)
+
+
+def test_cycle_displacement_is_a_repeated_rigid_motion() -> None:
+    clip = make_clip(yaw_per_cycle=0.7, cycle_offset_rotation=True)
+    x, y, yaw = clip.cycle_displacement
+    assert (x, y, yaw) == pytest.approx((0.8, 0.1, 0.7))
+    turn = Rotation.from_euler("z", yaw)
+    pos, quat = clip.root_pos[2], Rotation.from_quat(clip.root_quat[2], scalar_first=True)
+    start, end = clip.root_pos[0] * [1, 1, 0], clip.root_pos[-1] * [1, 1, 0]
+    for cycle in range(1, 4):
+        pos, quat = turn.apply(pos - start) + end, turn * quat
+        time = cycle * clip.cycle_duration + 2 * clip.frame_duration
+        qpos, qvel = sample(clip.to_arrays(), time)
+        np.testing.assert_allclose(qpos[:3], pos, atol=1e-4)
+        got = Rotation.from_quat(np.asarray(qpos[3:7]), scalar_first=True)
+        assert (got * quat.inv()).magnitude() < 1e-4
+        first = frame_velocities(clip)[0][2]
+        turned = Rotation.from_euler("z", cycle * yaw).apply(first)
+        np.testing.assert_allclose(qvel[:3], turned, atol=1e-3)
+
+
+def test_offset_flags_off_repeat_the_first_cycle() -> None:
+    clip = make_clip(yaw_per_cycle=0.7, cycle_offset_position=False)
+    np.testing.assert_array_equal(clip.cycle_displacement, 0.0)
+    times = jnp.array([0.12, 0.12 + 3 * clip.cycle_duration], jnp.float32)
+    qpos, _ = SAMPLE(clip.to_arrays(), times)
+    np.testing.assert_allclose(qpos[0], qpos[1], atol=1e-4)
+
+
+def test_velocities_are_derivatives_of_the_motion() -> None:
+    clip = make_clip(num_frames=401)
+    times = np.linspace(0.1, 19.0, 23)
+    step = 0.05
+    arrays = clip.to_arrays()
+    now, vel = SAMPLE(arrays, jnp.asarray(times, jnp.float32))
+    ahead, _ = SAMPLE(arrays, jnp.asarray(times + step, jnp.float32))
+    behind, _ = SAMPLE(arrays, jnp.asarray(times - step, jnp.float32))
+    slope = np.asarray(ahead - behind) / (2 * step)
+    np.testing.assert_allclose(vel[:, :3], slope[:, :3], atol=2e-3)
+    np.testing.assert_allclose(vel[:, 6:], slope[:, 7:], atol=2e-3)
+    turns = [Rotation.from_quat(np.asarray(q[:, 3:7]), scalar_first=True) for q in (behind, ahead)]
+    body = (turns[0].inv() * turns[1]).as_rotvec() / (2 * step)
+    np.testing.assert_allclose(vel[:, 3:6], body, atol=2e-3)
+    assert np.abs(body).max() > 0.05
+    np.testing.assert_allclose(np.linalg.norm(now[:, 3:7], axis=1), 1.0, atol=1e-6)
+
+
+def test_clamped_clip_holds_its_ends() -> None:
+    clip = make_clip(loop="clamp")
+    times = jnp.array([-1.0, clip.cycle_duration + 1.0], jnp.float32)
+    qpos, qvel = SAMPLE(clip.to_arrays(), times)
+    np.testing.assert_allclose(qpos, clip.qpos[[0, -1]], atol=1e-6)
+    np.testing.assert_array_equal(qvel, 0.0)
+
+
+@pytest.mark.parametrize("layout", ["peng", "amp"])
+def test_both_layouts_round_trip(tmp_path: Path, layout: Any) -> None:
+    clip = make_clip(yaw_per_cycle=0.3, cycle_offset_rotation=True)
+    write_clip(clip, tmp_path / "walk.json", layout)
+    back = read_clip(tmp_path / "walk.json")
+    np.testing.assert_allclose(back.qpos, clip.qpos, atol=1e-6)
+    for field in ("frame_duration", "loop", "cycle_offset_position", "cycle_offset_rotation"):
+        assert getattr(back, field) == getattr(clip, field)
+    assert back.name == "walk"
+    rows = np.array(json.loads((tmp_path / "walk.json").read_text())["Frames"])
+    np.testing.assert_allclose(rows[:, 3:7], clip.root_quat[:, [1, 2, 3, 0]], atol=1e-6)
+    assert rows.shape[1] == {"peng": 19, "amp": 61}[layout]
+
+
+def test_amp_velocities_and_toes_are_derivatives(tmp_path: Path) -> None:
+    clip = make_clip(num_frames=401)
+    write_clip(clip, tmp_path / "walk.json", "amp")
+    rows = np.array(json.loads((tmp_path / "walk.json").read_text())["Frames"])
+    toes = rows[:, 19:31]
+    np.testing.assert_allclose(toes, foot_paths(clip).reshape(-1, 12), atol=1e-6)
+    slope = np.gradient(toes, clip.frame_duration, axis=0)[1:-1]
+    np.testing.assert_allclose(rows[1:-1, 49:61], slope, atol=2e-3)
+    world = Rotation.from_quat(rows[:, 3:7])
+    spin = (world[2:] * world[:-2].inv()).as_rotvec() / (2 * clip.frame_duration)
+    np.testing.assert_allclose(rows[1:-1, 34:37], spin, atol=2e-3)
+
+
+def test_legs_in_another_order_are_put_right(tmp_path: Path) -> None:
+    clip = make_clip()
+    write_clip(clip, tmp_path / "walk.json")
+    data = json.loads((tmp_path / "walk.json").read_text())
+    for frame in data["Frames"]:
+        fr, fl, rr, rl = (frame[i : i + 3] for i in (7, 10, 13, 16))
+        frame[7:] = fl + fr + rl + rr
+    (tmp_path / "other.json").write_text(json.dumps(data))
+    back = read_clip(tmp_path / "other.json", legs=("FL", "FR", "RL", "RR"))
+    np.testing.assert_allclose(back.joint_pos, clip.joint_pos, atol=1e-6)
+    with pytest.raises(ValueError, match="permutation of FR, FL, RR, RL"):
+        read_clip(tmp_path / "other.json", legs=("FL", "FL", "RL", "RR"))
+
+
+def _set(key: str, value: Any) -> Any:
+    return lambda data: data.__setitem__(key, value)
+
+
+def _number(frame: int, column: int, value: Any) -> Any:
+    return lambda data: data["Frames"][frame].__setitem__(column, value)
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (lambda d: d["Frames"][3].pop(), "frame 3 has 18 numbers, need 19 as in frame 0"),
+        (
+            lambda d: [f.pop() for f in d["Frames"]],
+            r"frame 0 has 18 numbers, need 19 \(peng\) or 61",
+        ),
+        (_number(4, 8, float("nan")), "frame 4, number 8 is nan"),
+        (_number(2, 7, "0.1"), "frame 2, number 7 is '0.1'"),
+        (_number(5, 6, 3.0), "frame 5: quaternion norm"),
+        (_set("FrameDuration", 0.0), "key FrameDuration is 0.0"),
+        (_set("FrameDuration", -0.1), "key FrameDuration is -0.1"),
+        (_set("FrameDuration", "fast"), "key FrameDuration is 'fast'"),
+        (_set("LoopMode", "Bounce"), "key LoopMode is 'Bounce', need 'Wrap' or 'Clamp'"),
+        (_set("EnableCycleOffsetPosition", 1), "key EnableCycleOffsetPosition is 1"),
+        (lambda d: d.pop("EnableCycleOffsetRotation"), "key EnableCycleOffsetRotation is missing"),
+        (lambda d: d.pop("Frames"), "key Frames is missing"),
+        (_set("Frames", [[0.0] * 19]), "at least 2 frames"),
+        (_set("Frames", [1, 2, 3]), "frame 0 is no list"),
+    ],
+)
+def test_bad_files_are_refused_with_the_place(tmp_path: Path, damage: Any, message: str) -> None:
+    path = tmp_path / "bad.json"
+    write_clip(make_clip(), path)
+    data = json.loads(path.read_text())
+    damage(data)
+    path.write_text(json.dumps(data))
+    with pytest.raises(ValueError, match=message) as error:
+        read_clip(path)
+    assert str(path) in str(error.value)
+
+
+def test_text_that_is_not_json_names_the_line(tmp_path: Path) -> None:
+    path = tmp_path / "bad.json"
+    path.write_text('{\n"LoopMode": "Wrap",\n"FrameDuration": 0.02\n"Frames": []}')
+    with pytest.raises(ValueError, match="line 4, column 1: not JSON"):
+        read_clip(path)
+    with pytest.raises(FileNotFoundError):
+        read_clip(tmp_path / "absent.json")
+
+
+def test_wrong_shapes_are_refused() -> None:
+    clip = make_clip()
+    with pytest.raises(ValueError, match=r"joint_pos has shape \(9, 11\), need \[F, 12\]"):
+        dataclasses.replace(clip, joint_pos=clip.joint_pos[:, :11])
+    with pytest.raises(ValueError, match="9, 9 and 8 frames"):
+        dataclasses.replace(clip, joint_pos=clip.joint_pos[:-1])
+    with pytest.raises(ValueError, match="frame_duration 0"):
+        dataclasses.replace(clip, frame_duration=0)
+    with pytest.raises(ValueError, match="loop 'once'"):
+        dataclasses.replace(clip, loop="once")

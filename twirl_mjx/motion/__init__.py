@@ -1,0 +1,1 @@
+"""Reference motions: clips, their files, the leap and how it was planned."""

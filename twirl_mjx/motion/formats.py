@@ -1,0 +1,188 @@
+"""Clip files: reader and writer of two published JSON layouts.
+
+Both are a JSON object with ``LoopMode`` ("Wrap" or "Clamp"), ``FrameDuration`` (s),
+``EnableCycleOffsetPosition``, ``EnableCycleOffsetRotation`` and ``Frames``. They differ in the
+numbers of a frame; quaternions are x y z w in both, joints FR FL RR RL x hip thigh calf:
+
+* ``peng`` (Peng et al. 2020), 19 numbers: root position, root quaternion, 12 joint angles.
+* ``amp``, 61 numbers: the 19 above, then toe positions (12), linear velocity (3), angular velocity
+  (3), joint velocities (12) and toe velocities (12). Everything after the first 19 follows from
+  them; it is recomputed on reading and writing. Toes are written in the world frame, as in the
+  A1 files this was checked with.
+
+The joint order cannot be told from a file: for another one pass ``legs`` to ``read_clip``.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from twirl_mjx.motion.clip import Clip, LoopMode, frame_velocities
+from twirl_mjx.sim import a1, kinematics
+
+Layout = Literal["peng", "amp"]
+FRAME_SIZES: dict[str, int] = {"peng": 19, "amp": 61}
+"""Numbers in a frame."""
+LOOP_MODES: dict[str, LoopMode] = {"Wrap": "wrap", "Clamp": "clamp"}
+
+
+def read_clip(path: str | Path, legs: Sequence[str] = a1.LEGS) -> Clip:
+    """Read a clip of either layout; the frame size tells which.
+
+    Args:
+        path: The file. Keys other than those of the layout (``MotionWeight``, say) are ignored.
+        legs: Order of the legs in the file, a permutation of FR FL RR RL.
+
+    Returns:
+        The motion, named after the file.
+
+    Raises:
+        FileNotFoundError: no such file.
+        ValueError: the file is malformed; the message names the file and the line, key or frame.
+    """
+    path = Path(path)
+    if sorted(legs) != sorted(a1.LEGS):
+        raise ValueError(f"legs {list(legs)} must be a permutation of {', '.join(a1.LEGS)}")
+    data = _parse(path)
+    frames = _frames(path, data)
+    joints = frames[:, 7:19].reshape(-1, 4, 3)[:, [list(legs).index(leg) for leg in a1.LEGS]]
+    try:
+        return Clip(
+            root_pos=frames[:, :3],
+            root_quat=frames[:, [6, 3, 4, 5]],
+            joint_pos=joints.reshape(-1, a1.NUM_JOINTS),
+            frame_duration=_duration(path, data),
+            loop=_loop(path, data),
+            cycle_offset_position=_flag(path, data, "EnableCycleOffsetPosition"),
+            cycle_offset_rotation=_flag(path, data, "EnableCycleOffsetRotation"),
+            name=path.stem,
+        )
+    except ValueError as error:
+        raise error if str(path) in str(error) else ValueError(f"{path}: {error}") from error
+
+
+def _parse(path: Path) -> dict[str, Any]:
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+    except json.JSONDecodeError as error:
+        where = f"line {error.lineno}, column {error.colno}"
+        raise ValueError(f"{path}: {where}: not JSON: {error.msg}") from error
+    except UnicodeDecodeError as error:
+        raise ValueError(f"{path}: byte {error.start}: not UTF-8 text") from error
+    if not isinstance(data, dict):
+        raise ValueError(f"{path}: line 1: need a JSON object, got {type(data).__name__}")
+    return data
+
+
+def _value(path: Path, data: dict[str, Any], key: str) -> Any:
+    if key not in data:
+        raise ValueError(f"{path}: key {key} is missing (keys present: {', '.join(data)})")
+    return data[key]
+
+
+def _flag(path: Path, data: dict[str, Any], key: str) -> bool:
+    value = _value(path, data, key)
+    if not isinstance(value, bool):
+        raise ValueError(f"{path}: key {key} is {value!r}, need true or false")
+    return value
+
+
+def _duration(path: Path, data: dict[str, Any]) -> float:
+    value = _value(path, data, "FrameDuration")
+    if not _is_number(value) or not value > 0:
+        raise ValueError(f"{path}: key FrameDuration is {value!r}, need a time in s above 0")
+    return float(value)
+
+
+def _loop(path: Path, data: dict[str, Any]) -> LoopMode:
+    value = _value(path, data, "LoopMode")
+    if not isinstance(value, str) or value not in LOOP_MODES:
+        raise ValueError(f"{path}: key LoopMode is {value!r}, need 'Wrap' or 'Clamp'")
+    return LOOP_MODES[value]
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def _frames(path: Path, data: dict[str, Any]) -> np.ndarray:
+    """Return the frames [F, 19 or 61], every number checked."""
+    frames = _value(path, data, "Frames")
+    if not isinstance(frames, list) or len(frames) < 2:
+        raise ValueError(f"{path}: key Frames must be a list of at least 2 frames")
+    sizes = " or ".join(f"{size} ({name})" for name, size in FRAME_SIZES.items())
+    for index, frame in enumerate(frames):
+        if not isinstance(frame, list):
+            raise ValueError(f"{path}: frame {index} is no list of numbers")
+        expected = {len(frames[0])} if index else set(FRAME_SIZES.values())
+        if len(frame) not in expected:
+            need = f"{len(frames[0])} as in frame 0" if index else sizes
+            raise ValueError(f"{path}: frame {index} has {len(frame)} numbers, need {need}")
+        for column, value in enumerate(frame):
+            if not _is_number(value):
+                raise ValueError(f"{path}: frame {index}, number {column} is {value!r}")
+    return np.array(frames, np.float64)
+
+
+def write_clip(clip: Clip, path: str | Path, layout: Layout = "peng") -> None:
+    """Write a clip; reading it back gives the same motion to 6 decimals.
+
+    Args:
+        clip: The motion.
+        path: File to write; its folder must exist.
+        layout: ``peng`` (small) or ``amp``.
+
+    Raises:
+        ValueError: unknown layout.
+    """
+    if layout not in FRAME_SIZES:
+        raise ValueError(f"unknown clip layout {layout!r}: choose {' or '.join(FRAME_SIZES)}")
+    rows = np.concatenate([clip.root_pos, clip.root_quat[:, [1, 2, 3, 0]], clip.joint_pos], axis=1)
+    if layout == "amp":
+        rows = np.concatenate([rows, _derived(clip)], axis=1)
+    head = {
+        "LoopMode": {mode: name for name, mode in LOOP_MODES.items()}[clip.loop],
+        "FrameDuration": clip.frame_duration,
+        "EnableCycleOffsetPosition": clip.cycle_offset_position,
+        "EnableCycleOffsetRotation": clip.cycle_offset_rotation,
+    }
+    lines = [f"{json.dumps(key)}: {json.dumps(value)}," for key, value in head.items()]
+    frames = [json.dumps([round(float(v), 6) + 0.0 for v in row]) for row in rows]
+    body = ",\n".join(f"  {frame}" for frame in frames)
+    text = "{\n" + "\n".join(lines) + '\n"Frames": [\n' + body + "\n]\n}\n"
+    Path(path).write_text(text, encoding="utf-8")
+
+
+def _derived(clip: Clip) -> np.ndarray:
+    """Return what the AMP layout adds to a frame: [F, 42]."""
+    rotation = Rotation.from_quat(clip.root_quat, scalar_first=True)
+    root_vel, root_ang_vel, joint_vel = frame_velocities(clip)
+    arms = np.einsum("fij,flj->fli", rotation.as_matrix(), foot_arms(clip))
+    toes = clip.root_pos[:, None] + arms
+    ang_vel = rotation.apply(root_ang_vel)
+    step = 1e-5  # s, for the toes' velocity within the body
+    moved = kinematics.foot_positions(clip.joint_pos + step * joint_vel)
+    within = np.einsum("fij,flj->fli", rotation.as_matrix(), (moved - foot_arms(clip)) / step)
+    toe_vel = root_vel[:, None] + np.cross(ang_vel[:, None], arms) + within
+    count = clip.num_frames
+    return np.concatenate(
+        [toes.reshape(count, 12), root_vel, ang_vel, joint_vel, toe_vel.reshape(count, 12)], axis=1
+    )
+
+
+def foot_arms(clip: Clip) -> np.ndarray:
+    """Return the foot centres [F, 4, 3] m in the base frame."""
+    return kinematics.foot_positions(clip.joint_pos)
+
+
+def foot_paths(clip: Clip) -> np.ndarray:
+    """Return the foot centres [F, 4, 3] m in the world frame."""
+    rotation = Rotation.from_quat(clip.root_quat, scalar_first=True).as_matrix()
+    return clip.root_pos[:, None] + np.einsum("fij,flj->fli", rotation, foot_arms(clip))
