@@ -1,0 +1,111 @@
+"""Export a learned policy to one ONNX file that needs nothing of this package."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from twirl_mjx.policies.learned import NumpyPolicy, hidden_layers, load_policy
+from twirl_mjx.policies.onnx_file import METADATA_KEY, load_onnx
+
+OPSET = 17
+IR_VERSION = 8
+TOLERANCE = 1e-5
+"""Largest difference allowed between the exported graph and the numpy policy."""
+
+
+def build_graph(policy: NumpyPolicy) -> object:
+    """Return the ``onnx.ModelProto`` of a policy: MatMul, Add, Relu ..., Tanh.
+
+    The graph has one input ``observation`` [batch, O], as the task emits it (no normalisation),
+    and one output ``action`` [batch, A] in [-1, 1]. The header travels as the metadata property
+    ``twirl_mjx``, JSON text; ``task``, ``control_dt`` and the sizes are repeated in plain form.
+    """
+    from onnx import TensorProto, helper, numpy_helper
+
+    nodes, weights = [], []
+    last = "observation"
+    for layer in [*hidden_layers(policy.actor_params), "mean"]:
+        for name, value in policy.actor_params[layer].items():
+            weights.append(numpy_helper.from_array(value, f"{layer}.{name}"))
+        activation, out = ("Tanh", "action") if layer == "mean" else ("Relu", f"{layer}.output")
+        nodes += [
+            helper.make_node("MatMul", [last, f"{layer}.kernel"], [f"{layer}.product"]),
+            helper.make_node("Add", [f"{layer}.product", f"{layer}.bias"], [f"{layer}.sum"]),
+            helper.make_node(activation, [f"{layer}.sum"], [out]),
+        ]
+        last = out
+    ends = [("observation", policy.observation_size), ("action", policy.action_size)]
+    source, target = (
+        helper.make_tensor_value_info(name, TensorProto.FLOAT, ["batch", n]) for name, n in ends
+    )
+    graph = helper.make_graph(nodes, f"twirl_mjx {policy.header.task}", [source], [target], weights)
+    model = helper.make_model(
+        graph,
+        producer_name="twirl_mjx",
+        opset_imports=[helper.make_opsetid("", OPSET)],
+        ir_version=IR_VERSION,
+    )
+    header = policy.header
+    properties = {
+        METADATA_KEY: header.to_json(),
+        "task": header.task,
+        "control_dt": repr(header.control_dt),
+        "observation_size": str(header.observation_size),
+        "action_size": str(header.action_size),
+    }
+    helper.set_model_props(model, properties)
+    return model
+
+
+def max_difference(policy: NumpyPolicy, file: Path, rows: int = 256, seed: int = 0) -> float:
+    """Return the largest action difference between a policy and an ONNX file.
+
+    The observations are random, at scales from 0.1 to 10, alone and in batches.
+    """
+    rng = np.random.default_rng(seed)
+    scale = 10.0 ** rng.uniform(-1.0, 1.0, (rows, 1))
+    obs = (scale * rng.standard_normal((rows, policy.observation_size))).astype(np.float32)
+    exported = load_onnx(file)
+    batch = np.abs(exported.act(obs) - policy.act(obs)).max()
+    single = np.abs(exported.act(obs[0]) - policy.act(obs[0])).max()
+    return float(max(batch, single))
+
+
+def export_onnx(policy: NumpyPolicy | str | Path, out: str | Path) -> Path:
+    """Write a policy as ONNX and verify the written file before it takes its name.
+
+    Args:
+        policy: a loaded policy, a policy file or a run directory (its best policy).
+        out: target, ending in ``.onnx``.
+
+    Returns:
+        The path written.
+
+    Raises:
+        ValueError: wrong suffix, a policy that is already ONNX, or a file whose actions differ
+            from the policy's by more than ``TOLERANCE``.
+    """
+    import onnx
+
+    out = Path(out)
+    if out.suffix != ".onnx":
+        raise ValueError(f"{out}: an ONNX file ends in .onnx, got {out.suffix!r}")
+    loaded = policy if isinstance(policy, NumpyPolicy) else load_policy(policy)
+    if not isinstance(loaded, NumpyPolicy):
+        raise ValueError(f"{policy} is already an ONNX file; copy it")
+    model = build_graph(loaded)
+    onnx.checker.check_model(model)
+    out.parent.mkdir(parents=True, exist_ok=True)
+    partial = out.with_name(out.name + ".partial")
+    onnx.save(model, str(partial))
+    difference = max_difference(loaded, partial)
+    if not difference <= TOLERANCE:
+        partial.unlink()
+        raise ValueError(
+            f"the exported graph differs from the policy by {difference:.2e} (allowed "
+            f"{TOLERANCE:.0e}); nothing was written to {out}"
+        )
+    partial.replace(out)
+    return out

@@ -1,0 +1,315 @@
+"""Headless pictures of episodes: H.264 video and strips of PNG frames.
+
+Frames are drawn by MuJoCo's own renderer through EGL (graphics card or Mesa), or OSMesa where
+EGL does not exist. PyOpenGL fixes its platform once per process, so a program chooses before it
+imports MuJoCo: ``probe_gl`` says what works, and the command line sets ``MUJOCO_GL`` from it.
+"""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+import importlib
+import subprocess
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from twirl_mjx.deploy.video import overlay_text, strip_indices, write_strip, write_video
+
+GL_BACKENDS = ("egl", "osmesa")
+"""Headless OpenGL backends in the order they are tried."""
+
+GOAL_RGBA = (0.10, 0.65, 0.25, 0.9)
+_FIX = (
+    "on Debian and Ubuntu: `apt-get install libegl1 libgl1-mesa-dri` (EGL) or "
+    "`apt-get install libosmesa6` (OSMesa)"
+)
+
+
+class RenderError(RuntimeError):
+    """No way to draw on this machine; the message names what was tried and the fix."""
+
+
+@dataclasses.dataclass(frozen=True)
+class CameraView:
+    """A camera that follows the base."""
+
+    distance: float = 1.7
+    """Distance from the look-at point, m."""
+    azimuth: float = 120.0
+    """Direction of view about world z, deg; 90 looks along +y, so +x is to the right."""
+    elevation: float = -14.0
+    """Direction of view over the horizon, deg."""
+    height: float = 0.25
+    """Look-at height over the world's origin, m."""
+    smoothing_s: float = 0.3
+    """Time constant with which the look-at point follows the base, s."""
+
+
+def probe_gl(environ: Mapping[str, str]) -> str:
+    """Return the first headless backend that works, tried in processes of their own.
+
+    Args:
+        environ: environment of the caller; ``MUJOCO_GL`` in it is replaced for the trials.
+
+    Returns:
+        The value for ``MUJOCO_GL``.
+
+    Raises:
+        RenderError: none works.
+    """
+    code = "import mujoco; mujoco.GLContext(64, 64).make_current()"
+    failures = []
+    for backend in GL_BACKENDS:
+        base = {k: v for k, v in environ.items() if k != "PYOPENGL_PLATFORM"}
+        trial = subprocess.run(
+            [sys.executable, "-c", code],
+            env={**base, "MUJOCO_GL": backend},
+            capture_output=True,
+            text=True,
+            timeout=120,
+            check=False,
+        )
+        if trial.returncode == 0:
+            return backend
+        lines = trial.stderr.strip().splitlines() or [f"exit code {trial.returncode}"]
+        failures.append(f"{backend}: {lines[-1]}")
+    raise RenderError(_no_backend(failures))
+
+
+def _no_backend(failures: Sequence[str]) -> str:
+    return f"cannot draw without a display. Tried {'; '.join(failures)}. Fix: {_FIX}"
+
+
+def open_context(width: int, height: int) -> Any:
+    """Return a current OpenGL context from the first backend that works in this process.
+
+    Raises:
+        RenderError: none works; names each attempt.
+    """
+    failures = []
+    for backend in GL_BACKENDS:
+        try:
+            context = importlib.import_module(f"mujoco.{backend}").GLContext(width, height)
+            context.make_current()
+        except Exception as error:  # drivers and PyOpenGL fail in many types
+            failures.append(f"{backend}: {type(error).__name__}: {error}")
+        else:
+            return context
+    raise RenderError(_no_backend(failures))
+
+
+class SceneRenderer:
+    """Draws states of one model into RGB arrays; a context manager that frees the context."""
+
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        width: int = 640,
+        height: int = 480,
+        *,
+        antialias: bool = False,
+    ) -> None:
+        """Open a context of ``width`` x ``height`` pixels.
+
+        Args:
+            model: the scene; a copy with drawing settings of its own is used.
+            width: pixels.
+            height: pixels.
+            antialias: smooth edges; about twice the time where a processor draws.
+
+        Raises:
+            RenderError: no OpenGL backend works.
+        """
+        model = copy.copy(model)
+        model.vis.global_.offwidth, model.vis.global_.offheight = width, height
+        model.vis.quality.offsamples = 4 if antialias else 0
+        model.vis.quality.shadowsize = 2048
+        model.mat_reflectance[:] = 0.0  # a mirrored floor is a third of the drawing time
+        self.model, self.data = model, mujoco.MjData(model)
+        self._context = open_context(width, height)
+        self._scene = mujoco.MjvScene(model, maxgeom=2000)
+        self._option = mujoco.MjvOption()
+        self._camera = mujoco.MjvCamera()
+        self._rect = mujoco.MjrRect(0, 0, width, height)
+        self._gl = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._gl)
+
+    def __enter__(self) -> SceneRenderer:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def draw(
+        self,
+        qpos: np.ndarray,
+        view: CameraView,
+        look_at: np.ndarray,
+        goal: np.ndarray | None = None,
+    ) -> np.ndarray:
+        """Draw one state.
+
+        Args:
+            qpos: [19] MuJoCo layout.
+            view: camera.
+            look_at: [3] m, world point at the centre of the picture.
+            goal: [2] or [3] m, world position of a goal marker; ``None`` for none.
+
+        Returns:
+            [H, W, 3] uint8.
+        """
+        self.data.qpos[:] = qpos
+        mujoco.mj_kinematics(self.model, self.data)
+        mujoco.mj_comPos(self.model, self.data)
+        mujoco.mj_camlight(self.model, self.data)
+        self._camera.lookat[:] = look_at
+        self._camera.distance = view.distance
+        self._camera.azimuth, self._camera.elevation = view.azimuth, view.elevation
+        mujoco.mjv_updateScene(
+            self.model,
+            self.data,
+            self._option,
+            None,
+            self._camera,
+            mujoco.mjtCatBit.mjCAT_ALL.value,
+            self._scene,
+        )
+        if goal is not None:
+            self._add_goal(np.asarray(goal, float))
+        mujoco.mjr_render(self._rect, self._scene, self._gl)
+        pixels = np.empty((self._rect.height, self._rect.width, 3), np.uint8)
+        mujoco.mjr_readPixels(pixels, None, self._rect, self._gl)
+        return pixels[::-1].copy()
+
+    def close(self) -> None:
+        """Free the OpenGL context; harmless when repeated."""
+        if self._context is not None:
+            self._gl.free()
+            self._context.free()
+            self._context = None
+
+    def _add_goal(self, goal: np.ndarray) -> None:
+        """Put a disc and a pole at ``goal`` into the scene about to be drawn."""
+        base = np.array([goal[0], goal[1], goal[2] if goal.size == 3 else 0.0])
+        cylinder = mujoco.mjtGeom.mjGEOM_CYLINDER
+        for radius, half in ((0.07, 0.004), (0.01, 0.15)):
+            geom = self._scene.geoms[self._scene.ngeom]
+            size = np.array([radius, half, 0.0])
+            centre = np.array([base[0], base[1], base[2] + half])
+            rgba = np.array(GOAL_RGBA, np.float32)
+            mujoco.mjv_initGeom(geom, cylinder, size, centre, np.eye(3).ravel(), rgba)
+            self._scene.ngeom += 1
+
+
+def look_at_path(qpos: np.ndarray, view: CameraView, frame_dt: float) -> np.ndarray:
+    """Return the smoothed path [T, 3] m of the look-at point.
+
+    A first-order low-pass is run forwards and backwards, so the camera does not lag.
+
+    Args:
+        qpos: [T, 19].
+        view: camera.
+        frame_dt: time between frames, s.
+    """
+    path = np.column_stack([qpos[:, :2], np.full(len(qpos), view.height)])
+    path[:, 2] = np.maximum(path[:, 2], 0.6 * qpos[:, 2])
+    keep = np.exp(-frame_dt / view.smoothing_s) if view.smoothing_s > 0 else 0.0
+    for order in (slice(None), slice(None, None, -1)):
+        points = path[order]
+        for i in range(1, len(points)):
+            points[i] = keep * points[i - 1] + (1.0 - keep) * points[i]
+    return path
+
+
+def render_frames(
+    model: mujoco.MjModel,
+    qpos: np.ndarray,
+    *,
+    frame_dt: float = 0.05,
+    goals: np.ndarray | None = None,
+    captions: Sequence[Sequence[str]] | None = None,
+    view: CameraView | None = None,
+    size: tuple[int, int] = (640, 480),
+    antialias: bool = False,
+) -> Iterator[np.ndarray]:
+    """Yield the frames [H, W, 3] uint8 of a trajectory.
+
+    Args:
+        model: the scene; hurdle bands and terrain are part of it.
+        qpos: [T, model.nq] trajectory, one row per frame.
+        frame_dt: time between rows, s.
+        goals: [T, 2] or [T, 3] m, goal position per frame, world frame; ``None`` for none.
+        captions: T lists of text lines; ``None`` for none.
+        view: camera.
+        size: (width, height) in pixels.
+        antialias: smooth edges, slower.
+
+    Raises:
+        ValueError: lengths or widths that do not fit, or a state that is not finite.
+        RenderError: no OpenGL backend works.
+    """
+    qpos = np.asarray(qpos, float)
+    if qpos.ndim != 2 or qpos.shape[1] != model.nq or not len(qpos):
+        raise ValueError(f"qpos has shape {qpos.shape}, expected [T >= 1, {model.nq}]")
+    if not np.isfinite(qpos).all():
+        row = int(np.argwhere(~np.isfinite(qpos))[0, 0])
+        raise ValueError(f"qpos[{row}] is not finite; render the frames before it")
+    for name, values in (("goals", goals), ("captions", captions)):
+        if values is not None and len(values) != len(qpos):
+            raise ValueError(f"{len(values)} {name} for {len(qpos)} frames")
+    view = view or CameraView()
+    path = look_at_path(qpos, view, frame_dt)
+    with SceneRenderer(model, *size, antialias=antialias) as renderer:
+        for i, state in enumerate(qpos):
+            frame = renderer.draw(state, view, path[i], None if goals is None else goals[i])
+            yield frame if captions is None else overlay_text(frame, captions[i])
+
+
+def render_episode(
+    model: mujoco.MjModel,
+    qpos: np.ndarray,
+    stem: str | Path,
+    *,
+    frame_dt: float = 0.05,
+    panels: int = 8,
+    goals: np.ndarray | None = None,
+    captions: Sequence[Sequence[str]] | None = None,
+    view: CameraView | None = None,
+    size: tuple[int, int] = (640, 480),
+    antialias: bool = False,
+) -> tuple[Path, Path]:
+    """Write ``<stem>.mp4`` and ``<stem>.png``, a strip of ``panels`` frames, in one pass.
+
+    Args and raises: as ``render_frames``.
+
+    Returns:
+        The paths of the video and of the strip.
+    """
+    stem = Path(stem)
+    wanted = set(strip_indices(len(qpos), panels))
+    kept: list[np.ndarray] = []
+    frames = render_frames(
+        model,
+        qpos,
+        frame_dt=frame_dt,
+        goals=goals,
+        captions=captions,
+        view=view,
+        size=size,
+        antialias=antialias,
+    )
+
+    def watched() -> Iterator[np.ndarray]:
+        for i, frame in enumerate(frames):
+            if i in wanted:
+                kept.append(frame)
+            yield frame
+
+    video_path = write_video(stem.parent / f"{stem.name}.mp4", watched(), round(1.0 / frame_dt))
+    return video_path, write_strip(stem.parent / f"{stem.name}.png", kept)

@@ -1,0 +1,224 @@
+"""Source policies nobody trained: open-loop gaits with a phase clock, stillness and noise.
+
+A gait is a table of one period. Foot paths (a half-ellipse swing, a flat stance) become joint
+angles by closed-form leg kinematics, and the joint angles become actions by inverting the 4 Hz
+command filter harmonic by harmonic: a periodic signal keeps its frequencies, so what comes out
+of the filter is the wanted joint path itself, without lag.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import functools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from twirl_mjx.sim import a1, kinematics
+from twirl_mjx.sim.actuation import BUTTER_A, BUTTER_B
+from twirl_mjx.types import SourcePolicy
+
+
+@dataclasses.dataclass(frozen=True)
+class Gait:
+    """A periodic gait; legs in the order FR FL RR RL, hips in the order front, hind."""
+
+    period_steps: int
+    """Control steps (50 ms) of one period."""
+    offsets: tuple[float, float, float, float]
+    """Phase offset of each leg in periods; a leg touches down when its phase passes 0."""
+    duty: float
+    """Share of the period a foot is on the ground."""
+    stride: tuple[float, float]
+    """Foot travel relative to the hip during stance, m."""
+    lift: tuple[float, float]
+    """Foot height at mid-swing over the stance line, m."""
+    depth: tuple[float, float]
+    """Distance of the stance line below the hip joint, m."""
+    centre: tuple[float, float]
+    """Foot position at mid-stance, ahead of the hip joint, m."""
+    push: tuple[float, float] = (0.0, 0.0)
+    """Extra leg extension at the end of stance, m (negative shortens the leg)."""
+    ramp_steps: int = 10
+    """Control steps over which the gait fades in from the zero action."""
+
+
+TROT = Gait(
+    period_steps=8,
+    offsets=(0.0, 0.5, 0.5, 0.0),
+    duty=0.447,
+    stride=(0.167, 0.254),
+    lift=(0.113, 0.079),
+    depth=(0.3, 0.283),
+    centre=(-0.004, -0.054),
+    push=(0.008, -0.002),
+)
+"""Diagonal legs together, 2.5 Hz: 0.70 m/s on the nominal floor, upright on friction 0.4 too.
+
+Found by random search in C MuJoCo; it drifts a few degrees in 10 s, as open loops do.
+"""
+
+BOUND = Gait(
+    period_steps=10,
+    offsets=(0.0, 0.0, 0.5, 0.5),
+    duty=0.407,
+    stride=(0.3, 0.3),
+    lift=(0.055, 0.04),
+    depth=(0.27, 0.242),
+    centre=(0.016, -0.021),
+    push=(0.016, -0.007),
+)
+"""Front legs, then hind legs, 2 Hz: 0.85 m/s on the nominal floor (same search)."""
+
+
+def foot_path(gait: Gait, phase: np.ndarray, hind: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return foot x (forward) and z (up) relative to the hip joint, m.
+
+    Args:
+        gait: the gait.
+        phase: [P] leg phase in [0, 1); stance comes first.
+        hind: 0 for a front leg, 1 for a hind leg.
+    """
+    stance = np.clip(phase / gait.duty, 0.0, 1.0)
+    swing = np.clip((phase - gait.duty) / (1.0 - gait.duty), 0.0, 1.0)
+    in_swing = phase >= gait.duty
+    reach = np.where(in_swing, -0.5 * np.cos(np.pi * swing), 0.5 - stance)
+    x = gait.centre[hind] + gait.stride[hind] * reach
+    height = np.where(
+        in_swing,
+        gait.lift[hind] * np.sin(np.pi * swing),
+        -gait.push[hind] * np.sin(0.5 * np.pi * stance) ** 4,
+    )
+    return x, height - gait.depth[hind]
+
+
+def unfilter(targets: np.ndarray) -> np.ndarray:
+    """Return the periodic command whose filtered form is ``targets`` [P, J].
+
+    Harmonics that the filter passes at less than a quarter are left out: they would ask for
+    commands of several times the motion.
+    """
+    period = len(targets)
+    z = np.exp(-2j * np.pi * np.arange(period // 2 + 1) / period)
+    gain = np.polyval(BUTTER_B[::-1], z) / np.polyval(BUTTER_A[::-1], z)
+    keep = np.abs(gain) >= 0.25
+    spectrum = np.fft.rfft(targets, axis=0)
+    command = np.where(keep[:, None], spectrum / np.where(keep, gain, 1.0)[:, None], 0.0)
+    return np.fft.irfft(command, period, axis=0)
+
+
+@functools.cache
+def action_table(gait: Gait) -> np.ndarray:
+    """Return one period of actions [P, 12] float32 in [-1, 1].
+
+    Raises:
+        ValueError: a foot out of reach, or a joint path outside the action box.
+    """
+    feet = np.zeros((gait.period_steps, 4, 3))
+    feet[:, :, 1] = a1.SIDE_SIGNS * a1.THIGH_OFFSET
+    for leg, offset in enumerate(gait.offsets):
+        phase = (np.arange(gait.period_steps) / gait.period_steps + offset) % 1.0
+        feet[:, leg, 0], feet[:, leg, 2] = foot_path(gait, phase, leg // 2)
+    joints = kinematics.leg_inverse(feet + a1.HIP_OFFSETS)
+    action = (unfilter(joints) - a1.DEFAULT_POSE) / a1.ACTION_HALF_RANGE
+    worst = np.abs(action).max()
+    if worst > 1.0:
+        raise ValueError(
+            f"the gait needs actions up to {worst:.2f}, allowed are [-1, 1]: reduce stride or lift"
+        )
+    return action.astype(np.float32)
+
+
+@dataclasses.dataclass(frozen=True)
+class GaitPolicy:
+    """Plays a gait in every world; its memory is a clock [N] int32 in control steps."""
+
+    gait: Gait
+    """The gait."""
+
+    def init(self, state: Any) -> jax.Array:
+        """Return stopped clocks [N]."""
+        return jnp.zeros(state.world.episode_step.shape, jnp.int32)
+
+    def act(self, memory: jax.Array, state: Any, key: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Return actions [N, 12] and the advanced clocks [N]."""
+        del key
+        clock = jnp.where(state.world.episode_step == 0, 0, memory)
+        table = jnp.asarray(action_table(self.gait))
+        fade = jnp.minimum(clock.astype(jnp.float32) / max(self.gait.ramp_steps, 1), 1.0)
+        return table[clock % self.gait.period_steps] * fade[..., None], clock + 1
+
+
+@dataclasses.dataclass(frozen=True)
+class ZeroPolicy:
+    """Holds the default pose."""
+
+    def init(self, state: Any) -> None:
+        """Return no memory."""
+        del state
+
+    def act(self, memory: None, state: Any, key: jax.Array) -> tuple[jax.Array, None]:
+        """Return zero actions [N, 12]."""
+        del key
+        worlds = state.world.episode_step.shape
+        return jnp.zeros((*worlds, a1.NUM_JOINTS), jnp.float32), memory
+
+
+@dataclasses.dataclass(frozen=True)
+class RandomPolicy:
+    """Draws every action component from U(-1, 1)."""
+
+    def init(self, state: Any) -> None:
+        """Return no memory."""
+        del state
+
+    def act(self, memory: None, state: Any, key: jax.Array) -> tuple[jax.Array, None]:
+        """Return random actions [N, 12]."""
+        shape = (*state.world.episode_step.shape, a1.NUM_JOINTS)
+        return jax.random.uniform(key, shape, jnp.float32, -1.0, 1.0), memory
+
+
+class ClockedGait:
+    """A gait as a deployable policy: numpy only, and one clock that ``reset`` stops."""
+
+    def __init__(self, gait: Gait) -> None:
+        self.gait = gait
+        self.clock = 0
+
+    def reset(self) -> None:
+        """Start the gait anew."""
+        self.clock = 0
+
+    def act(self, obs: np.ndarray) -> np.ndarray:
+        """Return the next action [..., 12]; of ``obs`` [..., O] only the shape is used."""
+        fade = min(self.clock / max(self.gait.ramp_steps, 1), 1.0)
+        action = action_table(self.gait)[self.clock % self.gait.period_steps] * np.float32(fade)
+        self.clock += 1
+        return np.broadcast_to(action, (*np.shape(obs)[:-1], a1.NUM_JOINTS)).copy()
+
+
+SCRIPTED: dict[str, SourcePolicy] = {
+    "trot": GaitPolicy(TROT),
+    "bound": GaitPolicy(BOUND),
+    "zero": ZeroPolicy(),
+    "random": RandomPolicy(),
+}
+"""Scripted source policies by name."""
+
+
+def get_scripted(name: str) -> SourcePolicy:
+    """Return a scripted source policy.
+
+    Raises:
+        ValueError: unknown name; the message gives the closest one.
+    """
+    if name in SCRIPTED:
+        return SCRIPTED[name]
+    closest = difflib.get_close_matches(name, SCRIPTED, 1, 0.0)
+    raise ValueError(
+        f"no scripted policy {name!r}; did you mean {closest[0]!r}? There are: "
+        + ", ".join(sorted(SCRIPTED))
+    )
