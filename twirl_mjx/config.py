@@ -1,0 +1,449 @@
+"""Configuration: frozen dataclasses, presets by name, JSON in and out.
+
+Defaults are the paper's numbers (spec sections 2 to 5); ``make_config`` applies a preset. Values
+are checked when a config is built, long before anything is compiled.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import json
+from typing import Any, Literal
+
+Variant = Literal["scratch", "twirl", "twirl+weights", "weights", "zero-shot"]
+VARIANTS: tuple[Variant, ...] = ("scratch", "twirl", "twirl+weights", "weights", "zero-shot")
+TASKS = ("stand", "biped", "imitate", "hurdles")
+SHIFTS = ("none", "bumpy", "icy", "weakened", "sloped", "gravity")
+PRESETS = ("paper", "cpu", "debug")
+SOURCE_OF = {"biped": "stand", "hurdles": "imitate"}
+"""Task whose trained policy is the default source of another task."""
+
+
+def check_choice(what: str, value: str, choices: tuple[str, ...]) -> None:
+    """Refuse a value that is not one of ``choices``.
+
+    Raises:
+        ValueError: The message lists the choices and the nearest one.
+    """
+    if value not in choices:
+        nearest = (difflib.get_close_matches(value, choices, n=1, cutoff=0.0) or choices[:1])[0]
+        raise ValueError(
+            f"unknown {what} {value!r}: choose one of {', '.join(choices)} (nearest: {nearest!r})"
+        )
+
+
+def check_range(what: str, value: float, low: float, high: float) -> None:
+    """Refuse a number outside [low, high].
+
+    Raises:
+        ValueError: The message names the value, the range and the nearest end.
+    """
+    if not low <= value <= high:
+        nearest = low if not value > low else high
+        raise ValueError(f"{what} = {value} is outside [{low}, {high}] (nearest: {nearest})")
+
+
+@dataclasses.dataclass(frozen=True)
+class DroqConfig:
+    """The learner (paper Table 4; Hiraoka et al. 2021)."""
+
+    hidden_sizes: tuple[int, ...] = (256, 256)
+    """Units of the hidden layers of actor and critics."""
+    num_critics: int = 2
+    """Independent critics in the ensemble."""
+    dropout_rate: float = 0.01
+    """Share of hidden units dropped, in online and target critics alike."""
+    batch_size: int = 256
+    """Rows of one minibatch."""
+    discount: float = 0.99
+    """Discount per control step."""
+    learning_rate: float = 3e-4
+    """Adam step size of actor, critics and temperature."""
+    tau: float = 0.005
+    """Polyak rate of the target critic, after every critic step."""
+    utd: float = 20.0
+    """Critic updates per environment transition; may be below 1."""
+    updates_per_block: int = 20
+    """Critic updates between two updates of actor and temperature (20 = the paper's at UTD 20)."""
+    target_entropy: float | None = None
+    """nats; -A/2 when not given."""
+    initial_temperature: float = 1.0
+    """Entropy temperature at the start."""
+    matmul_dtype: Literal["float32", "bfloat16"] = "float32"
+    """Precision of matrix products; parameters and sums stay float32."""
+    fast: bool = True
+    """Use the fast form of the update; False is the plain flax/optax form of the same maths."""
+
+    def __post_init__(self) -> None:
+        """Check every number.
+
+        Raises:
+            ValueError: A value is out of range; the message has the numbers.
+        """
+        check_range("droq.num_critics", self.num_critics, 1, 100)
+        check_range("droq.dropout_rate", self.dropout_rate, 0.0, 0.9)
+        check_range("droq.batch_size", self.batch_size, 1, 1_000_000)
+        check_range("droq.discount", self.discount, 0.0, 1.0)
+        check_range("droq.learning_rate", self.learning_rate, 1e-8, 1.0)
+        check_range("droq.tau", self.tau, 0.0, 1.0)
+        check_range("droq.utd", self.utd, 1e-4, 1000.0)
+        check_range("droq.updates_per_block", self.updates_per_block, 1, 100_000)
+        check_range("droq.initial_temperature", self.initial_temperature, 1e-6, 100.0)
+        check_choice("droq.matmul_dtype", self.matmul_dtype, ("float32", "bfloat16"))
+        if not self.hidden_sizes or min(self.hidden_sizes) < 1:
+            raise ValueError(f"droq.hidden_sizes = {self.hidden_sizes} needs sizes >= 1")
+
+    @property
+    def replay_ratio(self) -> float:
+        """Replayed rows per environment transition, ``utd * batch_size``."""
+        return self.utd * self.batch_size
+
+
+@dataclasses.dataclass(frozen=True)
+class ReplayConfig:
+    """The mixed replay (paper Alg. 1)."""
+
+    phi: float = 0.5
+    """Share of every minibatch drawn from source data; exactly round(phi * batch_size) rows."""
+    capacity: int = 1_000_000
+    """Transitions the online ring holds."""
+    source_size: int = 50_000
+    """Transitions of the source policy collected in the target task."""
+
+    def __post_init__(self) -> None:
+        """Check every number.
+
+        Raises:
+            ValueError: A value is out of range.
+        """
+        check_range("replay.phi", self.phi, 0.0, 1.0)
+        check_range("replay.capacity", self.capacity, 1, 100_000_000)
+        check_range("replay.source_size", self.source_size, 1, 100_000_000)
+
+
+@dataclasses.dataclass(frozen=True)
+class StandConfig:
+    """Task ``stand``: get up on the hind legs."""
+
+    height_of: Literal["root", "front_feet"] = "root"
+    """Which height r_height rewards: the root's, or the mean of the front feet's (spec 5)."""
+    risen_fraction: float = 0.0
+    """Share of episodes started part-way up on the hind legs, at pitch U(0, 83 deg)."""
+
+    def __post_init__(self) -> None:
+        """Check the options.
+
+        Raises:
+            ValueError: A value is out of range.
+        """
+        check_choice("stand.height_of", self.height_of, ("root", "front_feet"))
+        check_range("stand.risen_fraction", self.risen_fraction, 0.0, 1.0)
+
+
+@dataclasses.dataclass(frozen=True)
+class BipedConfig:
+    """Task ``biped``: walk to a goal on the hind legs."""
+
+    goal_mean_radius: float = 1.5
+    """m, mean of the exponential distribution of the goal's distance."""
+    goal_min_radius: float = 0.3
+    """m, the drawn distance is clipped from below."""
+    goal_max_radius: float = 5.0
+    """m, the drawn distance is clipped from above."""
+    fixed_goal: tuple[float, float] = (1.5, 0.0)
+    """m, the goal when the course is fixed (dynamics shifts); on the hill in ``sloped``."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ImitateConfig:
+    """Task ``imitate``: track a leap clip."""
+
+    clip: str = "leap"
+    """``leap`` (ours) or the path of a clip file."""
+    max_root_error: float = 1.0
+    """m, an episode ends beyond this distance from the reference root."""
+    max_root_angle: float = 1.5707963
+    """rad, an episode ends beyond this rotation from the reference root."""
+
+
+@dataclasses.dataclass(frozen=True)
+class HurdlesConfig:
+    """Task ``hurdles``: jump over randomly spaced hurdles."""
+
+    min_gap: float = 1.6
+    """m, smallest distance between neighbouring hurdles, and to the first."""
+    max_gap: float = 2.6
+    """m, largest distance."""
+    fixed_gap: float = 2.1
+    """m, distance when the course is fixed (dynamics shifts)."""
+    hurdle_bonus: Literal["count", "event"] = "count"
+    """Pay the number of hurdles passed so far at every step, or 1 when one is passed."""
+
+
+@dataclasses.dataclass(frozen=True)
+class EnvConfig:
+    """The worlds."""
+
+    num_envs: int = 16
+    """Worlds stepped together."""
+    episode_length: int = 400
+    """Control steps of an episode (20 s at 20 Hz)."""
+    engine: Literal["auto", "mjx", "native"] = "auto"
+    """Physics engine; auto is mjx on an accelerator and native (C MuJoCo threads) on a CPU."""
+    course: Literal["auto", "random", "fixed"] = "auto"
+    """Goals and hurdles; auto is random without a shift and fixed under a shift (spec 6)."""
+
+    def __post_init__(self) -> None:
+        """Check every number.
+
+        Raises:
+            ValueError: A value is out of range.
+        """
+        check_range("env.num_envs", self.num_envs, 1, 1_000_000)
+        check_range("env.episode_length", self.episode_length, 1, 1_000_000)
+        check_choice("env.engine", self.engine, ("auto", "mjx", "native"))
+        check_choice("env.course", self.course, ("auto", "random", "fixed"))
+
+
+@dataclasses.dataclass(frozen=True)
+class EvalConfig:
+    """Evaluation during training: deterministic policy, its own seeds."""
+
+    every: int = 10_000
+    """Environment transitions between evaluations; rounded up to whole epochs."""
+    episodes: int = 16
+    """Episodes per evaluation."""
+    final_episodes: int = 100
+    """Episodes of the evaluation that closes a run."""
+    seed: int = 1_000_003
+    """Seed of evaluation during training; the final one uses ``seed + 1``."""
+
+    def __post_init__(self) -> None:
+        """Check every number.
+
+        Raises:
+            ValueError: A value is out of range.
+        """
+        check_range("eval.every", self.every, 1, 10**12)
+        check_range("eval.episodes", self.episodes, 1, 1_000_000)
+        check_range("eval.final_episodes", self.final_episodes, 1, 1_000_000)
+
+
+@dataclasses.dataclass(frozen=True)
+class TrainConfig:
+    """One training run."""
+
+    task: str = "biped"
+    """stand, biped, imitate or hurdles."""
+    shift: str = "none"
+    """Dynamics shift: none, bumpy, icy, weakened, sloped or gravity."""
+    shift_strength: float = 1.0
+    """0 is nominal, 1 the paper's value."""
+    variant: Variant = "twirl"
+    """scratch, twirl, twirl+weights, weights or zero-shot; stand and imitate have no source."""
+    source: str = "auto"
+    """auto (shipped policy, else train it), train, a scripted policy's name, or a policy file."""
+    seed: int = 0
+    """Random seed of the run."""
+    total_env_steps: int = 1_000_000
+    """Environment transitions to gather."""
+    warmup_env_steps: int = 1000
+    """Transitions with uniformly random actions before the first update."""
+    env: EnvConfig = EnvConfig()
+    """The worlds."""
+    droq: DroqConfig = DroqConfig()
+    """The learner."""
+    replay: ReplayConfig = ReplayConfig()
+    """The mixed replay."""
+    eval: EvalConfig = EvalConfig()
+    """Evaluation during training."""
+    stand: StandConfig = StandConfig()
+    """Options of task stand."""
+    biped: BipedConfig = BipedConfig()
+    """Options of task biped."""
+    imitate: ImitateConfig = ImitateConfig()
+    """Options of task imitate."""
+    hurdles: HurdlesConfig = HurdlesConfig()
+    """Options of task hurdles."""
+    epoch_env_steps: int = 2000
+    """Transitions per compiled epoch, after which Python logs; rounded to whole vector steps."""
+    checkpoint_minutes: float = 5.0
+    """Wall time between checkpoints of the full training state."""
+
+    def __post_init__(self) -> None:
+        """Check names, ranges and divisibility.
+
+        Raises:
+            ValueError: With the numbers and the nearest valid choice.
+        """
+        check_choice("task", self.task, TASKS)
+        check_choice("shift", self.shift, SHIFTS)
+        check_choice("variant", self.variant, VARIANTS)
+        check_range("shift_strength", self.shift_strength, 0.0, 2.0)
+        check_range("total_env_steps", self.total_env_steps, 1, 10**12)
+        check_range("warmup_env_steps", self.warmup_env_steps, 0, 10**12)
+        check_range("epoch_env_steps", self.epoch_env_steps, 1, 10**9)
+        check_range("checkpoint_minutes", self.checkpoint_minutes, 0.0, 1e6)
+        check_updates(self.droq, self.env.num_envs)
+        if self.replay.capacity < self.env.num_envs:
+            raise ValueError(
+                f"replay.capacity {self.replay.capacity} is below env.num_envs {self.env.num_envs}"
+            )
+
+    @property
+    def updates_per_step(self) -> int:
+        """Critic updates after each vector step, ``utd * num_envs``."""
+        return round(self.droq.utd * self.env.num_envs)
+
+    @property
+    def blocks_per_step(self) -> int:
+        """Blocks of critic updates (each with one actor update) after each vector step."""
+        return self.updates_per_step // self.droq.updates_per_block
+
+    @property
+    def steps_per_epoch(self) -> int:
+        """Vector steps in one compiled epoch."""
+        return max(1, round(self.epoch_env_steps / self.env.num_envs))
+
+    @property
+    def uses_source_data(self) -> bool:
+        """Whether minibatches hold source rows."""
+        return self.variant in ("twirl", "twirl+weights") and self.effective_phi > 0.0
+
+    @property
+    def effective_phi(self) -> float:
+        """Phi of this variant: 0 unless it trains on source data."""
+        return self.replay.phi if self.variant in ("twirl", "twirl+weights") else 0.0
+
+    @property
+    def fixed_course(self) -> bool:
+        """Whether goals and hurdles are fixed."""
+        if self.env.course == "auto":
+            return self.shift != "none"
+        return self.env.course == "fixed"
+
+
+def check_updates(droq: DroqConfig, num_envs: int) -> None:
+    """Check that UTD gives whole blocks of updates per vector step.
+
+    Raises:
+        ValueError: With the numbers, and the nearest ``utd`` that divides.
+    """
+    updates = droq.utd * num_envs
+    block = droq.updates_per_block
+    blocks = max(1, round(updates / block))
+    if abs(updates - blocks * block) > 1e-6:
+        raise ValueError(
+            f"droq.utd {droq.utd:g} x env.num_envs {num_envs} = {updates:g} critic updates per"
+            f" vector step, which is not a whole number of blocks of droq.updates_per_block"
+            f" {block} (nearest: utd {blocks * block / num_envs:g})"
+        )
+
+
+def _paper(task: str) -> TrainConfig:
+    sourced = task in SOURCE_OF
+    return TrainConfig(
+        task=task,
+        variant="twirl" if sourced else "scratch",
+        stand=StandConfig(height_of="front_feet", risen_fraction=0.0),
+    )
+
+
+def _cpu(task: str) -> TrainConfig:
+    base = _paper(task)
+    return dataclasses.replace(
+        base,
+        total_env_steps=2_000_000,
+        warmup_env_steps=6400,
+        epoch_env_steps=6400,
+        env=EnvConfig(num_envs=64),
+        droq=DroqConfig(utd=1.0, updates_per_block=8),
+        eval=EvalConfig(every=64_000, episodes=32),
+        stand=StandConfig(height_of="front_feet", risen_fraction=0.25),
+    )
+
+
+def _debug(task: str) -> TrainConfig:
+    base = _paper(task)
+    return dataclasses.replace(
+        base,
+        total_env_steps=96,
+        warmup_env_steps=32,
+        epoch_env_steps=32,
+        env=EnvConfig(num_envs=4, episode_length=20),
+        droq=DroqConfig(utd=1.0, updates_per_block=4, batch_size=16, hidden_sizes=(32, 32)),
+        replay=ReplayConfig(capacity=1000, source_size=64),
+        eval=EvalConfig(every=64, episodes=2, final_episodes=4),
+        checkpoint_minutes=0.0,
+    )
+
+
+def make_config(task: str, preset: str = "paper") -> TrainConfig:
+    """Return the config of a task under a preset.
+
+    Args:
+        task: One of ``TASKS``.
+        preset: ``paper`` (the paper's numbers), ``cpu`` (the same method, settings for two CPU
+            cores) or ``debug`` (seconds, for tests).
+
+    Raises:
+        ValueError: Unknown task or preset, with the nearest valid name.
+    """
+    check_choice("task", task, TASKS)
+    check_choice("preset", preset, PRESETS)
+    return {"paper": _paper, "cpu": _cpu, "debug": _debug}[preset](task)
+
+
+def to_json(config: TrainConfig) -> str:
+    """Return the config as indented JSON with every field."""
+    return json.dumps(dataclasses.asdict(config), indent=2, sort_keys=True) + "\n"
+
+
+def from_dict(kind: type, values: dict[str, Any], where: str = "config") -> Any:
+    """Build a config dataclass from plain values (as JSON gives them).
+
+    Raises:
+        ValueError: An unknown key, with the nearest valid one, or a value out of range.
+    """
+    fields = {f.name: f for f in dataclasses.fields(kind)}
+    for key in values:
+        check_choice(f"key in {where}", key, tuple(fields))
+    made = {}
+    for key, value in values.items():
+        default = fields[key].default
+        if dataclasses.is_dataclass(default) and isinstance(value, dict):
+            value = from_dict(type(default), value, f"{where}.{key}")
+        elif isinstance(value, list):
+            value = tuple(value)
+        made[key] = value
+    return kind(**made)
+
+
+def from_json(text: str) -> TrainConfig:
+    """Read a config written by :func:`to_json`.
+
+    Raises:
+        ValueError: The text is not JSON, or holds an unknown key or a bad value.
+    """
+    return from_dict(TrainConfig, json.loads(text))
+
+
+def diff(a: TrainConfig, b: TrainConfig) -> list[str]:
+    """Return one line ``key: a -> b`` for every field in which two configs differ."""
+    flat_a, flat_b = flatten(a), flatten(b)
+    return [f"{k}: {flat_a[k]!r} -> {flat_b[k]!r}" for k in flat_a if flat_a[k] != flat_b[k]]
+
+
+def flatten(config: TrainConfig) -> dict[str, Any]:
+    """Return the config as a flat dict with dotted keys."""
+
+    def walk(value: Any, prefix: str) -> dict[str, Any]:
+        if not dataclasses.is_dataclass(value):
+            return {prefix[:-1]: value}
+        out: dict[str, Any] = {}
+        for field in dataclasses.fields(value):
+            out |= walk(getattr(value, field.name), f"{prefix}{field.name}.")
+        return out
+
+    return walk(config, "")

@@ -1,0 +1,115 @@
+"""A source dataset on disk: transitions of the target task, checked when read."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+
+import numpy as np
+
+from twirl_mjx.types import Transition
+
+FORMAT = "twirl-source-dataset"
+VERSION = 1
+
+
+class DatasetError(ValueError):
+    """A file that is not a usable source dataset; the message says why."""
+
+
+@dataclasses.dataclass(frozen=True)
+class DatasetHeader:
+    """What a dataset says about itself."""
+
+    task: str
+    """Target task whose observations, rewards and terminations were recorded."""
+    shift: str
+    """Dynamics shift of the worlds."""
+    source: str
+    """Name or origin of the policy that acted."""
+    size: int
+    """Transitions."""
+    observation_size: int
+    """O."""
+    action_size: int
+    """A."""
+    mean_return: float
+    """Mean return of the episodes that ended while collecting; NaN if none did."""
+    digest: str = ""
+    """Digest of what decides the data: policy, task options, shift, seed, size."""
+    format: str = FORMAT
+    version: int = VERSION
+
+
+def write(path: Path, header: DatasetHeader, data: Transition) -> None:
+    """Write a dataset, whole or not at all.
+
+    Args:
+        path: Target file, ``.npz``.
+        header: Its description.
+        data: Transitions [n, ...] as arrays.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(path.name + ".partial")
+    text = json.dumps(dataclasses.asdict(header), sort_keys=True)
+    arrays = {f.name: np.asarray(getattr(data, f.name)) for f in dataclasses.fields(data)}
+    with partial.open("wb") as file:
+        np.savez(file, header=np.array(text), **arrays)
+    partial.replace(path)
+
+
+def read(
+    path: Path, *, task: str, observation_size: int, action_size: int
+) -> tuple[DatasetHeader, Transition]:
+    """Read a dataset and check that it fits the target task.
+
+    Raises:
+        FileNotFoundError: No such file.
+        DatasetError: Unreadable, of another version or task, of wrong sizes, or not finite.
+    """
+    if not path.is_file():
+        raise FileNotFoundError(f"no source dataset at {path}; `twirl collect` makes one")
+    header, arrays = _load(path)
+    for what, found, need in (
+        ("task", header.task, task),
+        ("observation size", header.observation_size, observation_size),
+        ("action size", header.action_size, action_size),
+    ):
+        if found != need:
+            raise DatasetError(f"{path}: {what} is {found!r}, this run needs {need!r}")
+    shapes = {
+        "obs": (header.size, observation_size),
+        "action": (header.size, action_size),
+        "reward": (header.size,),
+        "terminated": (header.size,),
+        "next_obs": (header.size, observation_size),
+    }
+    for name, shape in shapes.items():
+        if name not in arrays or arrays[name].shape != shape:
+            found = arrays[name].shape if name in arrays else "nothing"
+            raise DatasetError(f"{path}: {name} has shape {found}, the header says {shape}")
+        bad = ~np.isfinite(arrays[name]).reshape(header.size, -1).all(axis=1)
+        if bad.any():
+            raise DatasetError(f"{path}: {name} is not finite in row {int(np.argmax(bad))}")
+    if np.abs(arrays["action"]).max(initial=0.0) > 1.0 + 1e-6:
+        raise DatasetError(f"{path}: actions reach {np.abs(arrays['action']).max():.3g}, limit 1")
+    return header, Transition(**{name: arrays[name] for name in shapes})
+
+
+def _load(path: Path) -> tuple[DatasetHeader, dict[str, np.ndarray]]:
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            arrays = {name: archive[name] for name in archive.files}
+        record = json.loads(str(arrays.pop("header")))
+    except (OSError, ValueError, KeyError, EOFError) as error:
+        raise DatasetError(f"{path} is not a readable source dataset: {error}") from error
+    if record.get("format") != FORMAT or record.get("version") != VERSION:
+        raise DatasetError(
+            f"{path} is {record.get('format')!r} version {record.get('version')}, this program"
+            f" reads {FORMAT!r} version {VERSION}: collect it again"
+        )
+    try:
+        return DatasetHeader(**record), arrays
+    except TypeError as error:
+        raise DatasetError(f"{path}: the header has wrong fields: {error}") from error

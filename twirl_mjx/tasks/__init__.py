@@ -1,0 +1,1 @@
+"""Tasks (Markov decision processes) over the A1, and how to make their worlds."""

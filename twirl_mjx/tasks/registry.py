@@ -1,0 +1,93 @@
+"""Tasks by name, and worlds from a config."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+
+from twirl_mjx.config import TASKS as TASK_NAMES
+from twirl_mjx.config import TrainConfig, check_choice, make_config
+from twirl_mjx.sim.dynamics import SceneKind, get_shift, make_dynamics
+from twirl_mjx.sim.engine import make_engine
+from twirl_mjx.sim.scene import SimOptions, build_scene
+from twirl_mjx.tasks.base import Task
+from twirl_mjx.tasks.biped import Biped
+from twirl_mjx.tasks.stand import Stand
+from twirl_mjx.tasks.vector import VectorEnv
+
+TASKS: dict[str, Callable[[TrainConfig], Task]] = {
+    "stand": Stand,
+    "biped": Biped,
+}
+
+
+def make_task(config: TrainConfig) -> Task:
+    """Return the task a config names.
+
+    Raises:
+        ValueError: Unknown name, with the nearest valid one.
+    """
+    check_choice("task", config.task, TASK_NAMES)
+    return TASKS[config.task](config)
+
+
+def make_env(
+    config: TrainConfig,
+    *,
+    num_envs: int | None = None,
+    scene_kind: SceneKind | None = None,
+    threads: int | None = None,
+) -> VectorEnv:
+    """Return the worlds a config describes.
+
+    Args:
+        config: Task, shift and options.
+        num_envs: Worlds, ``config.env.num_envs`` by default.
+        scene_kind: Ground, that of the config's shift by default.
+        threads: Host threads of the native engine, all by default.
+    """
+    task = make_task(config)
+    scene = build_scene(
+        scene_kind or get_shift(config.shift).scene, collision=task.collision, options=SimOptions()
+    )
+    return VectorEnv(
+        task,
+        scene,
+        make_engine(config.env.engine, scene, threads),
+        num_envs=num_envs or config.env.num_envs,
+        episode_length=config.env.episode_length,
+        dynamics=make_dynamics(config.shift, config.shift_strength),
+    )
+
+
+def make(
+    task: str,
+    shift: str = "none",
+    num_envs: int = 256,
+    *,
+    shift_strength: float = 1.0,
+    engine: str = "auto",
+    config: TrainConfig | None = None,
+) -> VectorEnv:
+    """Return vectorised worlds of a task.
+
+    Args:
+        task: stand, biped, imitate or hurdles.
+        shift: none, bumpy, icy, weakened, sloped or gravity.
+        num_envs: Worlds stepped together.
+        shift_strength: 0 is nominal, 1 the paper's value.
+        engine: auto, mjx or native.
+        config: Further options; the paper's defaults when not given.
+
+    Raises:
+        ValueError: An unknown name or a value out of range, with the nearest valid choice.
+    """
+    check_choice("task", task, TASK_NAMES)
+    base = config or TrainConfig(task=task)
+    env = dataclasses.replace(base.env, num_envs=num_envs, engine=engine)  # type: ignore[arg-type]
+    droq = dataclasses.replace(base.droq, utd=base.droq.updates_per_block / num_envs)
+    return make_env(
+        dataclasses.replace(
+            base, task=task, shift=shift, shift_strength=shift_strength, env=env, droq=droq
+        )
+    )

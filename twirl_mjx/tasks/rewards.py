@@ -1,0 +1,60 @@
+"""Reward terms: one pure function each, unweighted (paper appendix, spec section 5)."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+
+
+def normalised_cosine(cosine: jax.Array) -> jax.Array:
+    """Return (0.5 c + 0.5)^2 in [0, 1] for a cosine in [-1, 1] (paper eq. "upright")."""
+    return (0.5 * cosine + 0.5) ** 2
+
+
+def height_bonus(height: jax.Array) -> jax.Array:
+    """Return exp(h) - 1 for a height in m (paper, term "max height")."""
+    return jnp.exp(height) - 1.0
+
+
+def stand(cosine: jax.Array, height: jax.Array) -> jax.Array:
+    """Return r_stand = r_upright + r_height."""
+    return normalised_cosine(cosine) + height_bonus(height)
+
+
+def facing_cosine(base_z_axis_w: jax.Array, displacement: jax.Array) -> jax.Array:
+    """Return the cosine between the base's down vector and the way to the goal.
+
+    Args:
+        base_z_axis_w: [3] unit base z-axis, world frame.
+        displacement: [2] m, horizontal displacement from the base to the goal, world frame.
+
+    Returns:
+        Cosine in [-1, 1]; 0 when the base is at the goal.
+    """
+    distance = jnp.linalg.norm(displacement)
+    return -jnp.dot(base_z_axis_w[:2], displacement) / jnp.maximum(distance, 1e-6)
+
+
+def distance_progress(distance: jax.Array, previous: jax.Array) -> jax.Array:
+    """Return 1 within 0.01 m of the goal, 0.5 when nearer than before, else 0."""
+    return jnp.where(distance <= 0.01, 1.0, jnp.where(distance < previous, 0.5, 0.0))
+
+
+def forward(speed: jax.Array) -> jax.Array:
+    """Return 1 when the base moves along x faster than 0.5 m/s, else 0.007 (paper, "Forward")."""
+    return jnp.where(speed > 0.5, 1.0, 0.007)
+
+
+def orientation(angle: jax.Array) -> jax.Array:
+    """Return exp(-2 theta), theta in rad from upright-forward (paper, "Orientation")."""
+    return jnp.exp(-2.0 * angle)
+
+
+def joint_calm(joint_vel: jax.Array) -> jax.Array:
+    """Return exp(-0.1 |qdot|_2) of joint velocities [12] in rad/s (paper, "Joint velocity")."""
+    return jnp.exp(-0.1 * jnp.linalg.norm(joint_vel))
+
+
+def kernel(weighted_square_error: jax.Array) -> jax.Array:
+    """Return exp(-e) of a weighted squared error (paper Table 2; Peng et al. 2020)."""
+    return jnp.exp(-weighted_square_error)

@@ -1,0 +1,245 @@
+"""Vectorised worlds of one task: reset, step, auto-reset that keeps the true last observation."""
+
+from __future__ import annotations
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import mujoco
+from mujoco import mjx
+
+from twirl_mjx.sim import actuation
+from twirl_mjx.sim.dynamics import Dynamics, broadcast
+from twirl_mjx.sim.engine import Engine, Trace, make_data
+from twirl_mjx.sim.scene import CONTROL_DT, Scene
+from twirl_mjx.tasks.base import Outcome, Task, World, make_view
+from twirl_mjx.tasks.observations import layout_size
+from twirl_mjx.types import Metrics, Transition
+
+MAX_STATE = 1e4
+"""A world whose position or velocity exceeds this (SI units) counts as diverged."""
+
+
+@flax.struct.dataclass
+class EnvState:
+    """State of N worlds between two control steps; reset and step return identical shapes."""
+
+    data: mjx.Data
+    """Simulation data of all worlds, after auto-reset; leaves [N, ...]."""
+    obs: jax.Array
+    """[N, O] what the policy sees next, after auto-reset."""
+    next_obs: jax.Array
+    """[N, O] true successor observation, before auto-reset."""
+    reward: jax.Array
+    """[N] reward of the step."""
+    terminated: jax.Array
+    """[N] bool, the MDP ended: no bootstrap."""
+    truncated: jax.Array
+    """[N] bool, the time limit was reached: bootstrap from ``next_obs``."""
+    invalid: jax.Array
+    """[N] bool, the step was not finite and must not be learned from; the world was reset."""
+    metrics: Metrics
+    """Every reward term, unweighted, and the task's measures, each [N] float32."""
+    world: World
+    """Everything else, leaves [N, ...]."""
+
+    @property
+    def done(self) -> jax.Array:
+        """[N] bool, the episode ended and the world was reset."""
+        return self.terminated | self.truncated | self.invalid
+
+
+class VectorEnv:
+    """N worlds of one task in one scene; holds constants only, all methods are pure."""
+
+    def __init__(
+        self,
+        task: Task,
+        scene: Scene,
+        engine: Engine,
+        *,
+        num_envs: int,
+        episode_length: int,
+        dynamics: Dynamics,
+    ) -> None:
+        """Bind a task to a scene.
+
+        Args:
+            task: The MDP.
+            scene: Compiled scene.
+            engine: Physics engine of that scene.
+            num_envs: N.
+            episode_length: Control steps before truncation.
+            dynamics: Default physical parameters of the worlds, leaves () or [N].
+        """
+        self.task = task
+        self.scene = scene
+        self.engine = engine
+        self.num_envs = num_envs
+        self.episode_length = episode_length
+        self.dynamics = broadcast(dynamics, num_envs)
+
+    @property
+    def observation_size(self) -> int:
+        """O."""
+        return layout_size(self.task.observer.layout)
+
+    @property
+    def action_size(self) -> int:
+        """A, one action per joint."""
+        return 12
+
+    @property
+    def control_dt(self) -> float:
+        """Control step in s."""
+        return CONTROL_DT
+
+    @property
+    def mj_model(self) -> mujoco.MjModel:
+        """The compiled model of the scene."""
+        return self.scene.mj_model
+
+    def reset(self, key: jax.Array, dynamics: Dynamics | None = None) -> EnvState:
+        """Start an episode in every world.
+
+        Args:
+            key: PRNG key; world ``i`` draws from ``fold_in(key, i)``, whatever N is.
+            dynamics: Physical parameters of this batch, leaves () or [N]; the env's by default.
+
+        Returns:
+            A state whose ``next_obs`` equals ``obs``, with reward 0 and all flags false.
+        """
+        dynamics = self.dynamics if dynamics is None else broadcast(dynamics, self.num_envs)
+        keys = jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(self.num_envs))
+        qpos, qvel, world, obs = jax.vmap(self._start_world)(keys, dynamics)
+        data = _place(make_data(self.scene, self.num_envs), qpos, qvel)
+        flags = jnp.zeros(self.num_envs, bool)
+        return EnvState(
+            data=data,
+            obs=obs,
+            next_obs=obs,
+            reward=jnp.zeros(self.num_envs),
+            terminated=flags,
+            truncated=flags,
+            invalid=flags,
+            metrics={name: jnp.zeros(self.num_envs) for name in self.task.metric_names},
+            world=world,
+        )
+
+    def step(self, state: EnvState, action: jax.Array) -> EnvState:
+        """Advance every world by one control step, then restart those whose episode ended.
+
+        Args:
+            state: The present state.
+            action: [N, 12], clipped to [-1, 1].
+
+        Raises:
+            ValueError: ``action`` has another shape.
+        """
+        if jnp.shape(action) != (self.num_envs, 12):
+            raise ValueError(f"action has shape {jnp.shape(action)}, need ({self.num_envs}, 12)")
+        finite_action = jnp.all(jnp.isfinite(action), axis=-1)
+        action = jnp.clip(jnp.nan_to_num(action.astype(jnp.float32)), -1.0, 1.0)
+        world, command = jax.vmap(_command)(state.world, action)
+        data, trace = self.engine.step(state.data, command, world.dynamics)
+        world, next_obs, outcome, finite = jax.vmap(self._judge_world)(world, command, trace)
+        invalid = ~(finite & finite_action)
+        ended = EnvState(
+            data=data,
+            obs=next_obs,
+            next_obs=jnp.where(invalid[:, None], state.obs, next_obs),
+            reward=jnp.where(invalid, 0.0, outcome.reward),
+            terminated=outcome.terminated & ~invalid,
+            truncated=(world.episode_step >= self.episode_length) & ~invalid,
+            invalid=invalid,
+            metrics={
+                name: jnp.where(invalid, 0.0, outcome.metrics[name].astype(jnp.float32))
+                for name in self.task.metric_names
+            },
+            world=world,
+        )
+        return jax.lax.cond(jnp.any(ended.done), self._restart, lambda s: s, ended)
+
+    def _start_world(
+        self, key: jax.Array, dynamics: Dynamics
+    ) -> tuple[jax.Array, jax.Array, World, jax.Array]:
+        key, start_key, motor_key = jax.random.split(key, 3)
+        start = self.task.start(start_key, self.scene, dynamics)
+        world = World(
+            key=key,
+            episode_step=jnp.zeros((), jnp.int32),
+            action=jnp.zeros(12),
+            filter=actuation.filter_init(start.qpos[7:]),
+            motors=actuation.motor_init(motor_key, dynamics),
+            dynamics=dynamics,
+            goal=start.goal,
+            memory=start.memory,
+            task=start.task,
+        )
+        obs = self.task.observer.observe(start.memory, start.goal, start.qpos, start.qvel)
+        return start.qpos, start.qvel, world, obs
+
+    def _judge_world(
+        self, world: World, command: actuation.MotorCommand, trace: Trace
+    ) -> tuple[World, jax.Array, Outcome, jax.Array]:
+        view = make_view(self.scene, world.dynamics, trace.qpos, trace.qvel)
+        torque = actuation.pd_torque(command, trace.qpos[:, 7:], trace.qvel[:, 6:])
+        memory = self.task.observer.push(world.memory, view.qpos, view.qvel, world.action)
+        world = world.replace(
+            memory=memory,
+            motors=actuation.motor_heat(world.motors, world.dynamics, torque, CONTROL_DT),
+            episode_step=world.episode_step + 1,
+        )
+        outcome = self.task.judge(world, view, self.scene)
+        world = world.replace(goal=outcome.goal, task=outcome.task)
+        obs = self.task.observer.observe(memory, world.goal, view.qpos, view.qvel)
+        state = jnp.concatenate([view.qpos, view.qvel])
+        finite = (
+            jnp.all(jnp.abs(state) < MAX_STATE)  # false for NaN too
+            & jnp.all(jnp.isfinite(obs))
+            & jnp.isfinite(outcome.reward)
+        )
+        return world, obs, outcome, finite
+
+    def _restart(self, state: EnvState) -> EnvState:
+        """Start new episodes in the worlds whose episode ended; leave the others untouched."""
+        done = state.done
+        qpos, qvel, world, obs = jax.vmap(self._start_world)(
+            state.world.key, state.world.dynamics
+        )
+        fresh = _place(make_data(self.scene, self.num_envs), qpos, qvel)
+        return state.replace(
+            data=_select(done, fresh, state.data),
+            world=_select(done, world, state.world),
+            obs=_select(done, obs, state.obs),
+        )
+
+
+def _command(world: World, action: jax.Array) -> tuple[World, actuation.MotorCommand]:
+    target, filter_state = actuation.filter_step(world.filter, actuation.action_to_target(action))
+    command = actuation.motor_command(world.motors, target)
+    return world.replace(filter=filter_state, action=action), command
+
+
+def _place(data: mjx.Data, qpos: jax.Array, qvel: jax.Array) -> mjx.Data:
+    return data.replace(qpos=qpos, qvel=qvel, ctrl=qpos[:, 7:])
+
+
+def _select(mask: jax.Array, new: EnvState, old: EnvState) -> EnvState:
+    """Take leaves [N, ...] of ``new`` where ``mask`` [N], else of ``old``."""
+
+    def pick(a: jax.Array, b: jax.Array) -> jax.Array:
+        return jnp.where(mask.reshape(mask.shape + (1,) * (a.ndim - 1)), a, b)
+
+    return jax.tree.map(pick, new, old)
+
+
+def make_transition(state: EnvState, action: jax.Array, result: EnvState) -> Transition:
+    """Return the experience [N] of a step: ``result = env.step(state, action)``."""
+    return Transition(
+        obs=state.obs,
+        action=jnp.clip(action, -1.0, 1.0),
+        reward=result.reward,
+        terminated=result.terminated,
+        next_obs=result.next_obs,
+    )

@@ -1,0 +1,212 @@
+"""Checkpoints of a run: Orbax for the state, an append-only log for the online ring.
+
+``checkpoints/policy`` holds the actor alone, ``checkpoints/train_state`` everything else that a
+run needs to go on bit for bit. The online ring would dominate both wall time and disk, so each
+checkpoint only writes the rows inserted since the last one (``checkpoints/replay``), and rows the
+ring has overwritten are deleted. The frozen source ring is not stored: it is read again from its
+dataset.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import orbax.checkpoint as ocp
+
+from twirl_mjx.training.state import TrainState
+
+KEEP = 2
+"""Checkpoints kept, newest first; an interrupted write falls back on the one before."""
+
+
+def _is_key(leaf: Any) -> bool:
+    return jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+
+
+def _flatten(tree: Any) -> dict[str, np.ndarray]:
+    """Return the leaves of a pytree by path, PRNG keys as their raw words."""
+    leaves = jax.tree_util.tree_flatten_with_path(tree)[0]
+    return {
+        jax.tree_util.keystr(path, simple=True, separator="."): np.asarray(
+            jax.random.key_data(leaf) if _is_key(leaf) else leaf
+        )
+        for path, leaf in leaves
+    }
+
+
+def _unflatten(template: Any, values: dict[str, np.ndarray]) -> Any:
+    """Return ``template`` with its leaves replaced by ``values`` of the same paths."""
+    paths, treedef = jax.tree_util.tree_flatten_with_path(template)
+    leaves = []
+    for path, leaf in paths:
+        name = jax.tree_util.keystr(path, simple=True, separator=".")
+        if name not in values:
+            raise ValueError(f"the checkpoint has no {name}: it is of another version or task")
+        value = values[name]
+        if _is_key(leaf):
+            leaves.append(jax.random.wrap_key_data(jnp.asarray(value)))
+            continue
+        if value.shape != leaf.shape:
+            raise ValueError(f"checkpoint {name} has shape {value.shape}, need {leaf.shape}")
+        leaves.append(jnp.asarray(value, leaf.dtype))
+    return jax.tree.unflatten(treedef, leaves)
+
+
+class Checkpoints:
+    """The checkpoints of one run directory."""
+
+    def __init__(self, run_dir: Path) -> None:
+        """Open (and create) ``run_dir/checkpoints``."""
+        self._root = (run_dir / "checkpoints").resolve()
+        self._replay = self._root / "replay"
+        self._replay.mkdir(parents=True, exist_ok=True)
+        self._manager = ocp.CheckpointManager(
+            self._root / "orbax",
+            item_names=("policy", "train_state", "progress"),
+            options=ocp.CheckpointManagerOptions(
+                max_to_keep=KEEP, create=True, enable_async_checkpointing=False
+            ),
+        )
+
+    def latest(self) -> int | None:
+        """Return the env steps of the newest checkpoint, None without one."""
+        return self._manager.latest_step()
+
+    def save(self, state: TrainState, progress: dict[str, Any]) -> None:
+        """Write a checkpoint; a second save at the same env steps does nothing.
+
+        Args:
+            state: State of one run, or of several with a leading seed axis.
+            progress: JSON-able facts of the Python loop (best score, wall time, ...).
+        """
+        step = int(np.max(np.asarray(state.env_steps)))
+        if step in self._manager.all_steps():
+            return
+        self._append_rows(state)
+        bare = state.replace(replay=state.replay.replace(source=None, online=_bare(state)))
+        self._manager.save(
+            step,
+            args=ocp.args.Composite(
+                policy=ocp.args.StandardSave(_flatten(state.learner.actor)),
+                train_state=ocp.args.StandardSave(_flatten(bare)),
+                progress=ocp.args.JsonSave(progress),
+            ),
+        )
+        self._manager.wait_until_finished()
+        self._prune(state)
+
+    def restore(self, template: TrainState) -> tuple[TrainState, dict[str, Any]]:
+        """Return the newest checkpoint as a state shaped like ``template``, and its progress.
+
+        The source ring is taken from ``template``.
+
+        Raises:
+            FileNotFoundError: There is none.
+            ValueError: It does not fit the template, or rows of the replay log are missing.
+        """
+        step = self.latest()
+        if step is None:
+            raise FileNotFoundError(f"no checkpoint in {self._root}")
+        bare = template.replace(
+            replay=template.replay.replace(source=None, online=_bare(template))
+        )
+        flat = {k: np.zeros(v.shape, v.dtype) for k, v in _flatten(bare).items()}
+        found = self._manager.restore(
+            step,
+            args=ocp.args.Composite(
+                train_state=ocp.args.StandardRestore(flat), progress=ocp.args.JsonRestore()
+            ),
+        )
+        state = _unflatten(bare, found["train_state"])
+        online = self._read_rows(state, template)
+        replay = template.replay.replace(online=online)
+        return state.replace(replay=replay), dict(found["progress"])
+
+    def close(self) -> None:
+        """Release the manager."""
+        self._manager.close()
+
+    def _segments(self) -> list[tuple[int, int, Path]]:
+        """Return (first, end, path) of the stored row ranges, in order."""
+        found = []
+        for path in self._replay.glob("rows_*.npy"):
+            first, end = map(int, path.stem.split("_")[1:])
+            found.append((first, end, path))
+        return sorted(found)
+
+    def _append_rows(self, state: TrainState) -> None:
+        """Write the online rows inserted since the last checkpoint."""
+        total = int(state.inserted)
+        capacity = state.replay.online.capacity
+        for first, _, path in self._segments():  # left by a run that died after writing them
+            latest = self.latest()
+            if latest is None or first >= self._logged(latest):
+                path.unlink()
+        stored = max([end for _, end, _ in self._segments()], default=0)
+        first = max(stored, total - capacity)
+        if first >= total:
+            return
+        rows = np.asarray(state.replay.online.rows)[np.arange(first, total) % capacity]
+        target = self._replay / f"rows_{first:012d}_{total:012d}.npy"
+        partial = target.with_suffix(".partial")
+        with partial.open("wb") as file:
+            np.save(file, rows)
+        partial.replace(target)
+
+    def _logged(self, step: int) -> int:
+        """Return how many rows had been inserted at a checkpoint."""
+        found = self._manager.restore(
+            step, args=ocp.args.Composite(progress=ocp.args.JsonRestore())
+        )
+        return int(found["progress"]["inserted"])
+
+    def _read_rows(self, state: TrainState, template: TrainState) -> Any:
+        """Rebuild the online ring from the log."""
+        online = template.replay.online
+        total, capacity = int(state.inserted), online.capacity
+        first_needed = max(0, total - capacity)
+        rows = np.zeros(online.rows.shape, np.float32)
+        have = first_needed
+        for first, end, path in self._segments():
+            if end <= have or first >= total:
+                continue
+            if first > have:
+                break
+            part = np.load(path)[have - first : total - first]
+            rows[np.arange(have, have + len(part)) % capacity] = part
+            have += len(part)
+        if have < total:
+            raise ValueError(f"replay log in {self._replay} ends at row {have}, need {total}")
+        return state.replay.online.replace(rows=jnp.asarray(rows))
+
+    def _prune(self, state: TrainState) -> None:
+        """Delete rows that no kept checkpoint needs."""
+        oldest = min(self._logged(step) for step in self._manager.all_steps())
+        for _, end, path in self._segments():
+            if end <= oldest - state.replay.online.capacity:
+                path.unlink()
+
+
+def _bare(state: TrainState) -> Any:
+    """Return the online ring without its rows."""
+    return state.replay.online.replace(rows=jnp.zeros((0, 0), jnp.float32))
+
+
+def read_progress(run_dir: Path) -> dict[str, Any]:
+    """Return ``progress`` of the newest checkpoint of a run, {} without one."""
+    paths = sorted((run_dir / "checkpoints" / "orbax").glob("[0-9]*"), key=lambda p: int(p.name))
+    if not paths:
+        return {}
+    text = (paths[-1] / "progress" / "metadata").read_text()
+    return json.loads(text)
+
+
+def remove(run_dir: Path) -> None:
+    """Delete the checkpoints of a finished run; policies and tables stay."""
+    shutil.rmtree(run_dir / "checkpoints", ignore_errors=True)

@@ -1,0 +1,321 @@
+"""The Python loop around the compiled epoch: logging, evaluation, checkpoints, signals."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import math
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from twirl_mjx.config import TrainConfig
+from twirl_mjx.droq import learner as droq
+from twirl_mjx.droq.state import DroqState
+from twirl_mjx.evaluation.rollout import make_evaluate
+from twirl_mjx.policies.learned import PolicyHeader, save_policy
+from twirl_mjx.replay.ring import RingBuffer
+from twirl_mjx.tasks.observations import layout_slices
+from twirl_mjx.tasks.registry import make_env
+from twirl_mjx.tasks.vector import VectorEnv
+from twirl_mjx.training import rundir, state
+from twirl_mjx.training.checkpoint import Checkpoints
+from twirl_mjx.training.metrics import RunLogger
+from twirl_mjx.training.state import TrainState
+
+EVAL_CSV = "eval.csv"
+EVAL_COLUMNS = (
+    "run", "task", "shift", "variant", "seed", "env_steps", "episode", "metric", "value",
+)  # fmt: skip
+
+
+class DivergedError(RuntimeError):
+    """The learner produced a number that is not finite; the last good checkpoint is kept."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Outcome:
+    """How a call of :func:`train` ended."""
+
+    finished: bool
+    """False when a signal stopped the run; the same command resumes it."""
+    env_steps: int
+    final: dict[str, float]
+    """Mean measures of the closing evaluation of the best policy; empty unless finished."""
+
+
+@contextmanager
+def stop_on_signal() -> Iterator[threading.Event]:
+    """Turn SIGTERM and Ctrl-C into an event; a second one interrupts at once."""
+    event = threading.Event()
+    if threading.current_thread() is not threading.main_thread():
+        yield event
+        return
+
+    def ask(number: int, frame: Any) -> None:
+        if event.is_set():
+            raise KeyboardInterrupt
+        event.set()
+
+    old = {s: signal.signal(s, ask) for s in (signal.SIGTERM, signal.SIGINT)}
+    try:
+        yield event
+    finally:
+        for number, handler in old.items():
+            signal.signal(number, handler)
+
+
+def act_mean(params: Any, memory: Any, env_state: Any, key: jax.Array) -> tuple[jax.Array, Any]:
+    """Act deterministically with actor parameters; an ``ActFn`` without memory."""
+    return droq.mean_action(params, env_state.obs), memory
+
+
+def no_memory(env_state: Any) -> tuple[()]:
+    """Return the memory of a policy that has none."""
+    return ()
+
+
+def eval_config(config: TrainConfig) -> TrainConfig:
+    """Return the config of evaluation: every episode starts as the task says."""
+    return dataclasses.replace(
+        config, stand=dataclasses.replace(config.stand, risen_fraction=0.0)
+    )
+
+
+def make_header(
+    config: TrainConfig, env: VectorEnv, card: dict[str, Any]
+) -> PolicyHeader:
+    """Return the header of a policy file of this run."""
+    layout = env.task.observer.layout
+    slices = layout_slices(layout)
+    return PolicyHeader(
+        task=config.task,
+        observation_size=env.observation_size,
+        action_size=env.action_size,
+        control_dt=env.control_dt,
+        observation_layout=tuple(
+            (e.name, slices[e.name].start, slices[e.name].stop, e.unit) for e in layout
+        ),
+        config_digest=rundir.digest(config),
+        versions=rundir.versions(),
+        card=card,
+    )
+
+
+@jax.jit
+def _finite(tree: Any) -> Any:
+    return jax.tree.map(lambda x: jnp.all(jnp.isfinite(x)), tree)
+
+
+def check_finite(learner: DroqState) -> None:
+    """Check that every number of the learner is finite.
+
+    Raises:
+        DivergedError: Naming the first tensor that is not.
+    """
+    floats = jax.tree.map(lambda x: x, learner)
+    for path, good in jax.tree_util.tree_flatten_with_path(_finite(floats))[0]:
+        if not bool(good):
+            name = jax.tree_util.keystr(path, simple=True, separator=".")
+            raise DivergedError(
+                f"the learner diverged: {name} is not finite. The last good checkpoint is kept;"
+                " resume it with a smaller droq.learning_rate under another --name"
+            )
+
+
+class Run:
+    """One training run: owns the directory, the compiled functions and the loop's bookkeeping."""
+
+    def __init__(
+        self, config: TrainConfig, run_dir: Path, source: RingBuffer | None, stage: str
+    ) -> None:
+        """Open the run directory and build (not compile) everything.
+
+        Raises:
+            RunMismatchError: The directory holds another run.
+        """
+        rundir.open_run(run_dir, config)
+        self.config = config
+        self.run_dir = run_dir
+        self.env = make_env(config)
+        self.checkpoints = Checkpoints(run_dir)
+        self.stage = stage
+        self.source = source
+        self.progress: dict[str, Any] = {"best": -math.inf, "wall_s": 0.0, "inserted": 0}
+        env = make_env(eval_config(config), num_envs=config.eval.episodes)
+        self._evaluate = make_evaluate(env, no_memory, act_mean)
+        self._epoch = state.compile_epoch(config, self.env)
+
+    def start(self, initial: Callable[[DroqState], DroqState] | None) -> TrainState:
+        """Return the state to begin or resume from.
+
+        Args:
+            initial: Changes the fresh learner, e.g. to start from source networks.
+        """
+
+        def fresh(key: jax.Array) -> TrainState:
+            return state.init(self.config, self.env, key, None)
+
+        key = jax.random.key(self.config.seed)
+        if self.checkpoints.latest() is None:
+            made = jax.jit(fresh)(key)
+            if initial is not None:
+                made = made.replace(learner=initial(made.learner))
+        else:
+            template = jax.tree.map(
+                lambda x: x if hasattr(x, "dtype") else jnp.asarray(x), jax.eval_shape(fresh, key)
+            )
+            made, progress = self.checkpoints.restore(template)
+            self.progress |= progress
+        return made.replace(replay=made.replay.replace(source=self.source))
+
+    def evaluate(self, train_state: TrainState) -> dict[str, float]:
+        """Evaluate the deterministic policy on the evaluation seed; keep the best policy."""
+        values = self._evaluate(train_state.learner.actor, jax.random.key(self.config.eval.seed))
+        means = {name: float(np.mean(v)) for name, v in values.items()}
+        self.save_policy("policy_last.npz", train_state, means)
+        if means["return"] > self.progress["best"]:
+            self.progress["best"] = means["return"]
+            self.save_policy("policy.npz", train_state, means)
+        return {f"eval/{name}": v for name, v in means.items()}
+
+    def save_policy(self, name: str, train_state: TrainState, means: dict[str, float]) -> None:
+        """Write the present actor as a policy file of the run."""
+        card = {
+            "seed": self.config.seed,
+            "variant": self.config.variant,
+            "shift": self.config.shift,
+            "env_steps": int(train_state.env_steps),
+            "grad_steps": int(train_state.learner.grad_steps),
+            "evaluation": means,
+        }
+        actor = jax.tree.map(np.asarray, train_state.learner.actor)
+        save_policy(self.run_dir / name, actor, make_header(self.config, self.env, card))
+
+    def save(self, train_state: TrainState) -> None:
+        """Write a checkpoint; refuses a state that is not finite."""
+        check_finite(train_state.learner)
+        self.progress["inserted"] = int(train_state.inserted)
+        self.checkpoints.save(train_state, self.progress)
+
+    def close(self) -> None:
+        """Release the checkpoint manager."""
+        self.checkpoints.close()
+
+    def loop(self, train_state: TrainState, logger: RunLogger, stop: threading.Event) -> TrainState:
+        """Run epochs until the budget is spent or ``stop`` is set; checkpoints on the way."""
+        config = self.config
+        saved = began = time.monotonic()
+        before = self.progress["wall_s"]
+        first = True
+        while (steps := int(train_state.env_steps)) < config.total_env_steps and not stop.is_set():
+            if first:
+                with logger.compiling("train_epoch"):
+                    train_state, metrics = self._epoch(train_state)
+                    jax.block_until_ready(metrics)
+                first = False
+            else:
+                train_state, metrics = self._epoch(train_state)
+            values = {name: float(value) for name, value in metrics.items()}
+            check_finite(train_state.learner)
+            self.progress["wall_s"] = before + time.monotonic() - began
+            now = int(train_state.env_steps)
+            if now // config.eval.every > steps // config.eval.every or (
+                now >= config.total_env_steps
+            ):
+                values |= self.evaluate(train_state)
+            logger.log(now, int(train_state.learner.grad_steps), values)
+            if time.monotonic() - saved > 60.0 * config.checkpoint_minutes:
+                self.save(train_state)
+                saved = time.monotonic()
+        self.save(train_state)
+        return train_state
+
+
+def train(
+    config: TrainConfig,
+    run_dir: Path,
+    *,
+    source: RingBuffer | None = None,
+    initial: Callable[[DroqState], DroqState] | None = None,
+    stage: str = "train",
+) -> Outcome:
+    """Train (or resume) one run to its budget.
+
+    Args:
+        config: The run; its ``total_env_steps`` is rounded up to whole epochs.
+        run_dir: Its directory.
+        source: Frozen source experience; needed when ``config.uses_source_data``.
+        initial: Changes the fresh learner before the first transition.
+        stage: Name shown with the progress.
+
+    Raises:
+        RunMismatchError: The directory holds another run.
+        DivergedError: The learner is no longer finite.
+        ValueError: Source data are needed and missing.
+    """
+    if config.uses_source_data and source is None:
+        raise ValueError(f"variant {config.variant} with phi {config.replay.phi} needs source data")
+    run = Run(config, run_dir, source, stage)
+    try:
+        train_state = run.start(initial)
+        steps = int(train_state.env_steps)
+        with (
+            stop_on_signal() as stop,
+            RunLogger(
+                run_dir, rundir.identity(run_dir, config), config.total_env_steps, stage, steps
+            ) as logger,
+        ):
+            if steps:
+                logger.announce(f"resuming {run_dir.name} at {steps:,} transitions")
+            train_state = run.loop(train_state, logger, stop)
+            steps = int(train_state.env_steps)
+            if steps < config.total_env_steps:
+                logger.announce(f"stopped at {steps:,} transitions; the same command resumes")
+                return Outcome(False, steps, {})
+            final = final_evaluation(config, run_dir, steps)
+            logger.log(
+                steps,
+                int(train_state.learner.grad_steps),
+                {f"eval/final_{k}": v for k, v in final.items()},
+            )
+            return Outcome(True, steps, final)
+    finally:
+        run.close()
+
+
+def final_evaluation(config: TrainConfig, run_dir: Path, env_steps: int) -> dict[str, float]:
+    """Evaluate the best policy of a run on fresh seeds and write ``eval.csv``."""
+    from twirl_mjx.policies.learned import load_policy
+
+    policy = load_policy(run_dir / "policy.npz")
+    env = make_env(eval_config(config), num_envs=config.eval.final_episodes)
+    evaluate = make_evaluate(env, no_memory, act_mean)
+    actor = jax.tree.map(jnp.asarray, dict(policy.actor_params))
+    values = evaluate(actor, jax.random.key(config.eval.seed + 1))
+    write_episodes(run_dir / EVAL_CSV, rundir.identity(run_dir, config), env_steps, values)
+    return {name: float(np.mean(v)) for name, v in values.items()}
+
+
+def write_episodes(
+    path: Path, identity: dict[str, str], env_steps: int, values: dict[str, np.ndarray]
+) -> None:
+    """Write episode measures [E] as a tidy table, whole or not at all."""
+    partial = path.with_name(path.name + ".partial")
+    with partial.open("w", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(EVAL_COLUMNS)
+        for name, column in values.items():
+            for episode, value in enumerate(column):
+                writer.writerow(
+                    [*identity.values(), env_steps, episode, name, f"{float(value):.9g}"]
+                )
+    partial.replace(path)

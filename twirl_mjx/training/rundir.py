@@ -1,0 +1,123 @@
+"""A run directory: its resolved config, what may change on resume, versions of everything."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import importlib.metadata
+import json
+import platform
+import subprocess
+from pathlib import Path
+
+from twirl_mjx import config as config_lib
+from twirl_mjx.config import TrainConfig
+
+CONFIG_NAME = "config.json"
+VERSIONS_NAME = "versions.json"
+PACKAGES = (
+    "twirl-mjx", "mujoco", "mujoco-mjx", "jax", "jaxlib", "brax", "flax", "optax",
+    "orbax-checkpoint", "numpy",
+)  # fmt: skip
+MAY_CHANGE = ("total_env_steps", "checkpoint_minutes", "eval.", "env.engine", "source")
+"""Fields a resumed run may have changed: they do not alter what was done so far."""
+
+
+class RunMismatchError(ValueError):
+    """A run directory that belongs to another configuration."""
+
+
+def default_name(config: TrainConfig, preset: str) -> str:
+    """Return the name of a run when none is given."""
+    shift = "" if config.shift == "none" else f"-{config.shift}"
+    return f"{config.task}{shift}-{config.variant.replace('+', '_')}-{preset}-s{config.seed}"
+
+
+def digest(config: TrainConfig) -> str:
+    """Return a short hash that identifies a resolved config."""
+    return hashlib.sha256(config_lib.to_json(config).encode()).hexdigest()[:12]
+
+
+def open_run(run_dir: Path, config: TrainConfig) -> None:
+    """Create a run directory, or check that an existing one belongs to this config.
+
+    Raises:
+        RunMismatchError: Another task or config lives there; the message has the differences.
+    """
+    path = run_dir / CONFIG_NAME
+    if path.exists():
+        old = config_lib.from_json(path.read_text())
+        lines = [
+            line
+            for line in config_lib.diff(old, config)
+            if not line.startswith(tuple(MAY_CHANGE))
+        ]
+        if lines:
+            shown = "\n  ".join(lines)
+            raise RunMismatchError(
+                f"{run_dir} holds another run; nothing was touched. Differences (there -> here):"
+                f"\n  {shown}\nGive the same settings to resume it, or another --name."
+            )
+    run_dir.mkdir(parents=True, exist_ok=True)
+    _write(path, config_lib.to_json(config))
+    _write(run_dir / VERSIONS_NAME, json.dumps(versions(), indent=2, sort_keys=True) + "\n")
+
+
+def read_config(run_dir: Path) -> TrainConfig:
+    """Return the config of a run.
+
+    Raises:
+        FileNotFoundError: ``run_dir`` is no run directory; the message lists the runs beside it.
+    """
+    path = run_dir / CONFIG_NAME
+    if not path.is_file():
+        parent = run_dir.parent
+        runs = sorted(p.parent.name for p in parent.glob(f"*/{CONFIG_NAME}"))
+        raise FileNotFoundError(
+            f"{run_dir} is not a run: it has no {CONFIG_NAME}; runs in {parent}:"
+            f" {', '.join(runs) or 'none'}"
+        )
+    return config_lib.from_json(path.read_text())
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of packages, interpreter, machine and source code."""
+    found = {}
+    for package in PACKAGES:
+        try:
+            found[package] = importlib.metadata.version(package)
+        except importlib.metadata.PackageNotFoundError:
+            found[package] = "not installed"
+    found["python"] = platform.python_version()
+    found["machine"] = f"{platform.system()} {platform.machine()}"
+    found["commit"] = _commit()
+    return found
+
+
+def _commit() -> str:
+    here = Path(__file__).resolve().parent
+    try:
+        out = subprocess.run(
+            ["git", "-C", str(here), "describe", "--always", "--dirty", "--abbrev=12"],
+            capture_output=True,
+            text=True,
+            timeout=10,
+            check=False,
+        )
+    except (OSError, subprocess.TimeoutExpired):
+        return "unknown"
+    return out.stdout.strip() or "unknown"
+
+
+def _write(path: Path, text: str) -> None:
+    partial = path.with_name(path.name + ".partial")
+    partial.write_text(text)
+    partial.replace(path)
+
+
+def identity(run_dir: Path, config: TrainConfig) -> dict[str, str]:
+    """Return the identity columns of the run's tables."""
+    fields = dataclasses.asdict(config)
+    return {"run": run_dir.name} | {
+        name: str(fields[name]) for name in ("task", "shift", "variant", "seed")
+    }

@@ -1,0 +1,205 @@
+"""The training state and the compiled epoch: collect, insert, sample, update."""
+
+from __future__ import annotations
+
+import functools
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+
+from twirl_mjx.config import TrainConfig
+from twirl_mjx.droq import learner as droq
+from twirl_mjx.droq.state import DroqState
+from twirl_mjx.evaluation import measures
+from twirl_mjx.evaluation.measures import Tracker
+from twirl_mjx.replay import mixed, ring
+from twirl_mjx.replay.mixed import MixedReplay
+from twirl_mjx.tasks.vector import EnvState, VectorEnv, make_transition
+from twirl_mjx.types import Metrics
+
+
+@flax.struct.dataclass
+class TrainState:
+    """Everything a run needs to go on; one pytree, one donated argument."""
+
+    learner: DroqState
+    """Networks, optimisers, temperature, critic updates so far."""
+    env: EnvState
+    """All worlds."""
+    replay: MixedReplay
+    """Both rings."""
+    tracker: Tracker
+    """Measures of the episodes under way."""
+    key: jax.Array
+    """PRNG key, split once per vector step."""
+    env_steps: jax.Array
+    """int32, transitions gathered (dropped ones included)."""
+    inserted: jax.Array
+    """int32, transitions inserted in the online ring, dropped ones excluded."""
+
+
+@flax.struct.dataclass
+class EpisodeSums:
+    """Sums over the episodes that ended, folded over an epoch."""
+
+    values: dict[str, jax.Array]
+    count: jax.Array
+
+
+def init(
+    config: TrainConfig,
+    env: VectorEnv,
+    key: jax.Array,
+    source: ring.RingBuffer | None,
+) -> TrainState:
+    """Return the state before the first transition.
+
+    Args:
+        config: The run.
+        env: Its worlds.
+        key: PRNG key of the run.
+        source: Frozen source experience, or None.
+    """
+    learner_key, env_key, key = jax.random.split(key, 3)
+    return TrainState(
+        learner=droq.init(learner_key, config.droq, env.observation_size, env.action_size),
+        env=env.reset(env_key),
+        replay=MixedReplay(
+            source=source,
+            online=ring.init(
+                min(config.replay.capacity, _rounded_total(config)),
+                env.observation_size,
+                env.action_size,
+            ),
+        ),
+        tracker=measures.tracker_init(config.task, env.num_envs),
+        key=key,
+        env_steps=jnp.zeros((), jnp.int32),
+        inserted=jnp.zeros((), jnp.int32),
+    )
+
+
+def _rounded_total(config: TrainConfig) -> int:
+    """Transitions the run will gather: whole epochs."""
+    epoch = config.steps_per_epoch * config.env.num_envs
+    return -(-config.total_env_steps // epoch) * epoch
+
+
+def collect_step(
+    config: TrainConfig, env: VectorEnv, state: TrainState, key: jax.Array
+) -> tuple[TrainState, EnvState]:
+    """Act once in every world and insert the transitions.
+
+    Actions are uniformly random in the first ``warmup_env_steps`` transitions.
+    """
+    warm_key, act_key = jax.random.split(key)
+    shape = (env.num_envs, env.action_size)
+    action = jnp.where(
+        state.env_steps < config.warmup_env_steps,
+        jax.random.uniform(warm_key, shape, minval=-1.0, maxval=1.0),
+        droq.sample_action(state.learner.actor, state.env.obs, act_key),
+    )
+    result = env.step(state.env, action)
+    valid = ~result.invalid & jnp.all(jnp.isfinite(action), axis=-1)
+    transition = make_transition(state.env, jnp.nan_to_num(action), result)
+    online = ring.insert(state.replay.online, transition, valid)
+    state = state.replace(
+        env=result,
+        replay=state.replay.replace(online=online),
+        env_steps=state.env_steps + env.num_envs,
+        inserted=state.inserted + jnp.sum(valid, dtype=jnp.int32),
+    )
+    return state, result
+
+
+def update_blocks(
+    config: TrainConfig, state: TrainState, key: jax.Array
+) -> tuple[DroqState, Metrics]:
+    """Run all blocks of critic updates that follow one vector step; none during warm-up.
+
+    A loop with a trip count, not a ``lax.cond``, decides: a conditional would copy the rings.
+
+    Returns:
+        The learner, and means over the blocks (NaN without any).
+    """
+    keys = jax.random.split(key, config.blocks_per_step)
+
+    def block(learner: DroqState, block_key: jax.Array) -> tuple[DroqState, Metrics]:
+        sample_key, update_key = jax.random.split(block_key)
+        minibatches = mixed.sample(
+            state.replay,
+            sample_key,
+            num_minibatches=config.droq.updates_per_block,
+            batch_size=config.droq.batch_size,
+            phi=config.effective_phi,
+        )
+        return droq.update(learner, config.droq, minibatches, update_key)
+
+    def body(i: jax.Array, carry: tuple[DroqState, Metrics]) -> tuple[DroqState, Metrics]:
+        learner, metrics = block(carry[0], keys[i])
+        return learner, jax.tree.map(jnp.add, carry[1], metrics)
+
+    shapes = jax.eval_shape(block, state.learner, keys[0])[1]
+    zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+    trips = jnp.where(state.env_steps > config.warmup_env_steps, config.blocks_per_step, 0)
+    learner, sums = jax.lax.fori_loop(0, trips, body, (state.learner, zeros))
+    return learner, jax.tree.map(lambda x: x / trips, sums)
+
+
+def train_step(
+    config: TrainConfig, env: VectorEnv, state: TrainState
+) -> tuple[TrainState, tuple[Metrics, Metrics, EpisodeSums]]:
+    """One vector step and its updates.
+
+    Returns:
+        The new state; learner metrics (NaN during warm-up); per-step means of the worlds; sums
+        over the episodes that ended.
+    """
+    key, act_key, update_key = jax.random.split(state.key, 3)
+    state, result = collect_step(config, env, state.replace(key=key), act_key)
+    tracker = measures.tracker_step(config.task, state.tracker, result)
+    done = result.done & ~result.invalid
+    finished = EpisodeSums(
+        values={
+            name: jnp.sum(jnp.where(done, value, 0.0))
+            for name, value in measures.tracker_read(config.task, tracker).items()
+        },
+        count=jnp.sum(done, dtype=jnp.float32),
+    )
+    state = state.replace(tracker=measures.tracker_reset(config.task, tracker, result.done))
+    learner, learner_metrics = update_blocks(config, state, update_key)
+    worlds = {f"world/{name}": jnp.mean(value) for name, value in result.metrics.items()}
+    worlds |= {
+        "reward": jnp.mean(result.reward),
+        "dropped_transitions": jnp.sum(result.invalid, dtype=jnp.float32),
+    }
+    return state.replace(learner=learner), (learner_metrics, worlds, finished)
+
+
+def train_epoch(
+    config: TrainConfig, env: VectorEnv, state: TrainState
+) -> tuple[TrainState, Metrics]:
+    """Run ``steps_per_epoch`` vector steps; the body of the only training jit.
+
+    Returns:
+        The new state and scalar metrics of the epoch; NaN where nothing was measured.
+    """
+    state, (learning, worlds, finished) = jax.lax.scan(
+        lambda s, _: train_step(config, env, s), state, length=config.steps_per_epoch
+    )
+    metrics = {name: jnp.nanmean(value) for name, value in learning.items()}
+    metrics |= {name: jnp.mean(value) for name, value in worlds.items()}
+    metrics["dropped_transitions"] = jnp.sum(worlds["dropped_transitions"])
+    episodes = jnp.sum(finished.count)
+    metrics |= {name: jnp.sum(value) / episodes for name, value in finished.values.items()}
+    metrics |= {
+        "episodes": episodes,
+        "online_rows": state.replay.online.size.astype(jnp.float32),
+    }
+    return state, metrics
+
+
+def compile_epoch(config: TrainConfig, env: VectorEnv):  # noqa: ANN201
+    """Return the jitted epoch; it donates its argument."""
+    return jax.jit(functools.partial(train_epoch, config, env), donate_argnums=0)
