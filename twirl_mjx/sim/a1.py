@@ -13,6 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
+from twirl_mjx.assets import asset_path
+
 LEGS = ("FR", "FL", "RR", "RL")
 FRONT_LEGS = (0, 1)
 HIND_LEGS = (2, 3)
@@ -161,12 +163,6 @@ def xml_path() -> Path:
     """Return the path of the robot's MJCF file.
 
     Raises:
-        FileNotFoundError: the project's ``assets`` folder is not beside the package.
+        FileNotFoundError: the file is in neither place where assets live.
     """
-    path = Path(__file__).resolve().parents[2] / "assets" / "a1" / "a1.xml"
-    if not path.is_file():
-        raise FileNotFoundError(
-            f"robot model {path} not found: install the project from its source tree "
-            "(pip install -e .), which holds the assets folder"
-        )
-    return path
+    return asset_path("a1", "a1.xml")
