@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from twirl_mjx.policies.learned import NumpyPolicy, hidden_layers, load_policy
 from twirl_mjx.policies.onnx_file import METADATA_KEY, load_onnx
+
+if TYPE_CHECKING:
+    import onnx
 
 OPSET = 17
 IR_VERSION = 8
@@ -15,7 +19,7 @@ TOLERANCE = 1e-5
 """Largest difference allowed between the exported graph and the numpy policy."""
 
 
-def build_graph(policy: NumpyPolicy) -> object:
+def build_graph(policy: NumpyPolicy) -> onnx.ModelProto:
     """Return the ``onnx.ModelProto`` of a policy: MatMul, Add, Relu ..., Tanh.
 
     The graph has one input ``observation`` [batch, O], as the task emits it (no normalisation),

@@ -135,7 +135,17 @@ def build_model(config: RehearsalConfig, hurdles: np.ndarray) -> mujoco.MjModel:
             rgba=[0.90, 0.33, 0.12, 1.0],
             **ground,
         )
-    spec.worldbody.add_light(pos=[0, 0, 5], dir=[0.2, 0.3, -1.0], castshadow=True)
+    sun = mujoco.mjtLightType.mjLIGHT_DIRECTIONAL
+    spec.worldbody.add_light(pos=[0, 0, 5], dir=[0.2, 0.3, -1.0], type=sun, castshadow=True)
+    spec.add_texture(
+        name="sky",
+        type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
+        builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT,
+        rgb1=[0.93, 0.96, 1.0],
+        rgb2=[0.55, 0.66, 0.78],
+        width=64,
+        height=64,
+    )
     model = spec.compile()
     model.actuator_gainprm[:], model.actuator_biasprm[:] = 0.0, 0.0
     model.actuator_gainprm[:, 0] = 1.0
@@ -171,7 +181,7 @@ class CommandFilter:
         """Start at rest at ``joint_pos`` [12] rad."""
         from scipy.signal import butter
 
-        self._b, self._a = butter(2, 4.0, fs=CONTROL_HZ)
+        self._b, self._a = np.asarray(butter(2, 4.0, fs=CONTROL_HZ))
         self._in, self._out = [joint_pos.copy()] * 2, [joint_pos.copy()] * 2
 
     def __call__(self, action: np.ndarray) -> np.ndarray:

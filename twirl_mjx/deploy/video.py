@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
+import itertools
+import subprocess
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -38,44 +41,72 @@ def _font(size: int) -> Any:
 def write_video(path: str | Path, frames: Iterable[np.ndarray], fps: int = 20) -> Path:
     """Write frames [H, W, 3] uint8 as H.264 (yuv420p) in an ``.mp4`` that any browser plays.
 
+    The encoder is started without ``fork``, which a process that runs jax must not use.
+
     Args:
-        path: target, ending in ``.mp4``.
+        path: target, ending in ``.mp4``; it is written whole or not at all.
         frames: pictures of one even size.
         fps: pictures per second.
 
     Raises:
-        ValueError: wrong suffix, odd size or no frame.
+        ValueError: wrong suffix, odd or changing size, or no frame.
+        RuntimeError: the encoder failed; the message holds its own.
     """
-    import imageio_ffmpeg
-
     path = Path(path)
     if path.suffix != ".mp4":
         raise ValueError(f"{path}: a video file ends in .mp4, got {path.suffix!r}")
+    pictures = iter(frames)
+    first = next(pictures, None)
+    if first is None:
+        raise ValueError("a video needs at least one frame")
+    height, width = first.shape[:2]
+    if height % 2 or width % 2:
+        raise ValueError(f"video frames need an even size, got {width} x {height}")
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(path.stem + ".partial.mp4")
-    writer = None
-    for frame in frames:
-        if writer is None:
-            height, width = frame.shape[:2]
-            if height % 2 or width % 2:
-                raise ValueError(f"video frames need an even size, got {width} x {height}")
-            writer = imageio_ffmpeg.write_frames(
-                str(partial),
-                (width, height),
-                fps=fps,
-                codec="libx264",
-                pix_fmt_out="yuv420p",
-                macro_block_size=2,
-                quality=7,
-                output_params=["-movflags", "+faststart"],
-            )
-            writer.send(None)
-        writer.send(np.ascontiguousarray(frame))
-    if writer is None:
-        raise ValueError("a video needs at least one frame")
-    writer.close()
+    encoder = _start_encoder(partial, width, height, fps)
+    try:
+        _feed(encoder, itertools.chain([first], pictures))
+    except BaseException:
+        encoder.kill()
+        encoder.communicate()
+        partial.unlink(missing_ok=True)
+        raise
     partial.replace(path)
     return path
+
+
+def _start_encoder(path: Path, width: int, height: int, fps: int) -> subprocess.Popen[bytes]:
+    """Start ffmpeg reading raw RGB frames from its standard input."""
+    import imageio_ffmpeg
+
+    source = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", str(fps)]
+    target = ["-an", "-c:v", "libx264", "-crf", "21", "-pix_fmt", "yuv420p"]
+    return subprocess.Popen(
+        [
+            imageio_ffmpeg.get_ffmpeg_exe(),
+            *("-y", "-loglevel", "error", *source, "-i", "-"),
+            *(*target, "-movflags", "+faststart", str(path)),
+        ],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+    )
+
+
+def _feed(encoder: subprocess.Popen[bytes], frames: Iterable[np.ndarray]) -> None:
+    """Send every frame and wait for the encoder to finish."""
+    shape, pipe = None, encoder.stdin
+    assert pipe is not None
+    with contextlib.suppress(BrokenPipeError):  # the encoder's own message is raised below
+        for frame in frames:
+            shape = shape or frame.shape
+            if frame.shape != shape:
+                raise ValueError(f"video frames change size from {shape} to {frame.shape}")
+            pipe.write(np.ascontiguousarray(frame, np.uint8).tobytes())
+    _, message = encoder.communicate()
+    if encoder.returncode != 0:
+        raise RuntimeError(f"the video encoder failed: {message.decode(errors='replace').strip()}")
 
 
 def strip_indices(count: int, panels: int) -> list[int]:

@@ -8,8 +8,10 @@ loading imports neither jax nor a simulator, so a file runs on a robot's compute
 from __future__ import annotations
 
 import dataclasses
+import io
 import json
 import zipfile
+import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -261,12 +263,14 @@ def save_policy(
 def _read_npz(path: Path) -> NumpyPolicy:
     """Read one policy file; every failure becomes a ``PolicyFileError`` with the reason."""
     try:
-        with np.load(path, allow_pickle=False) as archive:
-            arrays = {name: archive[name] for name in archive.files}
-    except (zipfile.BadZipFile, EOFError, OSError, ValueError, KeyError) as error:
+        archive = np.load(io.BytesIO(path.read_bytes()), allow_pickle=False)
+        if isinstance(archive, np.ndarray):
+            raise PolicyFileError(f"{path} holds one array, not a policy archive")
+        arrays = {name: archive[name] for name in archive.files}
+    except PolicyFileError:
+        raise
+    except (zipfile.BadZipFile, zlib.error, EOFError, OSError, ValueError, KeyError) as error:
         raise PolicyFileError(f"{path} is not a readable .npz archive: {error}") from error
-    except AttributeError as error:  # a bare .npy array has no ``files``
-        raise PolicyFileError(f"{path} holds one array, not a policy archive") from error
     text = arrays.pop("header", None)
     if text is None or text.dtype.kind != "U":
         raise PolicyFileError(f"{path} is not a policy: no header among {sorted(arrays)[:8]}")

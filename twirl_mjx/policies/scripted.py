@@ -127,7 +127,7 @@ def action_table(gait: Gait) -> np.ndarray:
     worst = np.abs(action).max()
     if worst > 1.0:
         raise ValueError(
-            f"the gait needs actions up to {worst:.2f}, allowed are [-1, 1]: reduce stride or lift"
+            f"the gait needs actions up to {worst:.2f}, allowed are [-1, 1]: make it smaller"
         )
     return action.astype(np.float32)
 

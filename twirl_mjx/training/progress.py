@@ -23,7 +23,7 @@ HEADLINES = (
     ("min_distance", "min distance", "{:.2f} m"),
     ("hurdles_passed", "hurdles", "{:.2f}"),
     ("temperature", "alpha", "{:.3g}"),
-    ("q", "Q", "{:.3g}"),
+    ("q_mean", "Q", "{:.3g}"),
     ("critic_loss", "critic loss", "{:.3g}"),
     ("actor_loss", "actor loss", "{:.3g}"),
     ("eval/return", "eval return", "{:.1f}"),

@@ -1,0 +1,206 @@
+from __future__ import annotations
+
+import dataclasses
+from collections import deque
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+from scipy import signal
+
+from twirl_mjx.deploy import rehearsal as module
+from twirl_mjx.deploy.rehearsal import IDEAL, RehearsalConfig, rehearse
+from twirl_mjx.deploy.robot import CommandFilter, Contacts, Sensors, build_model, motor_torque
+from twirl_mjx.policies.learned import PolicyHeader, save_policy
+from twirl_mjx.policies.scripted import BOUND, TROT, ClockedGait
+
+SHORT = dataclasses.replace(RehearsalConfig(), episode_s=0.5)
+HOME = np.tile([0.0, 0.9, -1.8], 4)
+
+
+class Constant:
+    """Answers every observation with one action."""
+
+    def __init__(self, action: float) -> None:
+        self.action = np.full(12, action, np.float32)
+
+    def act(self, obs: np.ndarray) -> np.ndarray:
+        del obs
+        return self.action
+
+
+@pytest.fixture(scope="module")
+def model() -> mujoco.MjModel:
+    return build_model(IDEAL, np.array([1.0, 2.5]))
+
+
+def test_torque_by_hand() -> None:
+    config = RehearsalConfig()
+    pos, vel = np.zeros(12), np.zeros(12)
+    target = np.zeros(12)
+    target[:3] = [0.1, 2.0, -2.0]
+    vel[3:6] = [1.0, 30.0, -30.0]
+    torque = motor_torque(config, target, pos, vel)
+    # 60 * 0.1; limits; braking 3 * 1 and, beyond the no-load speed, still with the whole torque
+    np.testing.assert_allclose(torque[:6], [6.0, 33.5, -33.5, -3.0, -33.5, 33.5], atol=1e-9)
+    speed = np.array([10.5, 15.75, 20.0, 21.0, -15.75])
+    vel = np.concatenate([speed, np.zeros(7)])
+    pulled = motor_torque(config, np.full(12, 10.0), pos, vel)
+    # full, half, 1/10.5, none of 33.5 N m; and all of it against the motion
+    np.testing.assert_allclose(pulled[:5], [33.5, 16.75, 33.5 / 10.5, 0.0, 33.5], atol=1e-9)
+
+
+def test_filter_equals_scipy_s() -> None:
+    rng = np.random.default_rng(0)
+    start = HOME + 0.1
+    actions = rng.uniform(-0.2, 0.2, (30, 12))
+    b, a = np.asarray(signal.butter(2, 0.4))
+    swing = np.tile([0.6, 1.2, 1.2], 4)
+    targets = HOME + swing * actions
+    rest = signal.lfilter_zi(b, a)[:, None] * start
+    expected, _ = signal.lfilter(b, a, targets, axis=0, zi=rest)
+    command = CommandFilter(start)
+    ours = np.array([command(action) for action in actions])
+    np.testing.assert_allclose(ours, expected, atol=1e-9)
+
+
+def test_targets_stay_within_the_joint_limits() -> None:
+    command = CommandFilter(HOME)
+    target = [command(np.ones(12)) for _ in range(20)][-1]
+    assert target[2] == pytest.approx(-0.916297857297)
+    assert target[1] == pytest.approx(2.1, abs=1e-3)
+
+
+def test_actuators_pass_torque_through(model: mujoco.MjModel) -> None:
+    data = mujoco.MjData(model)
+    data.ctrl[:] = np.arange(12) * 5.0
+    mujoco.mj_forward(model, data)
+    np.testing.assert_allclose(data.actuator_force, np.arange(12) * 5.0)
+    np.testing.assert_allclose(data.qfrc_actuator[6:], np.arange(12) * 5.0)
+    assert model.opt.timestep == 0.001
+
+
+def test_latency_delays_a_target_by_physics_steps(
+    model: mujoco.MjModel, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen = []
+
+    def spy(config: RehearsalConfig, target: np.ndarray, *state: np.ndarray) -> np.ndarray:
+        seen.append(target[0])
+        return motor_torque(config, target, *state)
+
+    monkeypatch.setattr(module, "motor_torque", spy)
+    data = mujoco.MjData(model)
+    mujoco.mj_resetDataKeyframe(model, data, model.key("home").id)
+    config = dataclasses.replace(IDEAL, latency_ms=70.0)
+    contacts, drive = Contacts(model, "biped"), module.Drive()
+    targets = deque([(0, HOME)])
+    for step in range(3):
+        start = step * config.n_substeps + config.latency_steps
+        targets.append((start, HOME + 0.001 * (step + 1)))
+        assert module.advance(model, data, config, targets, contacts, drive) is None
+    changes = np.flatnonzero(np.diff(seen)) + 1
+    np.testing.assert_array_equal(changes, [70, 120])
+    assert drive.peak.max() > 1.0
+
+
+def test_sensors_without_noise_are_exact_and_with_noise_have_its_size(
+    model: mujoco.MjModel,
+) -> None:
+    data = mujoco.MjData(model)
+    mujoco.mj_resetDataKeyframe(model, data, model.key("home").id)
+    exact = Sensors(IDEAL, np.random.default_rng(0)).read(data)
+    np.testing.assert_array_equal(exact.joint_pos, HOME)
+    np.testing.assert_allclose(exact.rotation, np.eye(3), atol=1e-12)
+    config = dataclasses.replace(IDEAL, joint_noise=0.01, orientation_noise=0.02)
+    sensors = Sensors(config, np.random.default_rng(0))
+    readings = [sensors.read(data) for _ in range(500)]
+    joints = np.array([r.joint_pos for r in readings])
+    assert np.std(joints - HOME) == pytest.approx(0.01, rel=0.05)
+    pitch = np.array([np.arcsin(-r.rotation[2, 0]) for r in readings])
+    assert np.std(pitch) == pytest.approx(0.02, rel=0.1)
+    for reading in readings[:5]:
+        np.testing.assert_allclose(reading.rotation @ reading.rotation.T, np.eye(3), atol=1e-9)
+
+
+def test_position_drifts_as_a_random_walk(model: mujoco.MjModel) -> None:
+    config = dataclasses.replace(IDEAL, position_drift=0.02)
+    data = mujoco.MjData(model)
+    ends = []
+    for seed in range(300):
+        sensors = Sensors(config, np.random.default_rng(seed))
+        ends.append([sensors.read(data) for _ in range(20)][-1].position - data.qpos[:3])
+    assert np.std(ends) == pytest.approx(0.02, rel=0.1)  # 20 readings are one second
+
+
+def test_episode_depends_on_its_seed_only() -> None:
+    results = [rehearse(ClockedGait(TROT), task="biped", episodes=2, seed=s, config=SHORT)
+               for s in (3, 3, 4)]  # fmt: skip
+    first, same, other = (r.episodes for r in results)
+    np.testing.assert_array_equal(first[1].qpos, same[1].qpos)
+    np.testing.assert_array_equal(first[1].observations, same[1].observations)
+    assert not np.array_equal(first[0].goals, first[1].goals)
+    assert not np.array_equal(first[1].goals, other[1].goals)
+    assert np.linalg.norm(first[0].goals[0]) == pytest.approx(1.0)
+
+
+def test_arrays_of_an_episode_line_up() -> None:
+    episode = rehearse(Constant(0.0), task="biped", episodes=1, config=SHORT).episodes[0]
+    assert episode.cause == "time"
+    assert episode.metrics["episode_length"] == 10
+    assert episode.qpos.shape == (11, 19)
+    assert episode.goals.shape == (11, 2)
+    assert episode.observations.shape == (10, 101)
+    assert episode.actions.shape == (10, 12)
+    assert episode.metrics["terminated"] == 0.0
+
+
+def test_falling_ends_a_stand_episode() -> None:
+    result = rehearse(Constant(-1.0), task="stand", episodes=1)
+    assert result.episodes[0].cause == "fall"
+    assert result.episodes[0].metrics["episode_length"] < 60
+    assert result.summary()["ended/fall"] == 1.0
+
+
+def test_touching_a_hurdle_ends_the_episode() -> None:
+    config = dataclasses.replace(IDEAL, hurdle_gap=0.6)
+    episode = rehearse(ClockedGait(BOUND), task="hurdles", episodes=1, config=config).episodes[0]
+    assert episode.cause == "hurdle"
+    assert 0.1 < episode.qpos[-1, 0] < 0.6
+    np.testing.assert_allclose(episode.goals, np.tile([0.6, 0.0], (len(episode.goals), 1)))
+    assert episode.observations.shape[1] == 95
+
+
+def test_policy_file_names_its_task(tmp_path: Path) -> None:
+    zero = {"kernel": np.zeros((101, 12)), "bias": np.zeros(12)}
+    header = PolicyHeader("stand", 101, 12, 0.05)
+    path = save_policy(tmp_path / "policy.npz", {"mean": zero, "log_std": zero}, header)
+    result = rehearse(path, episodes=1, config=SHORT)
+    assert result.task == "stand"
+    np.testing.assert_array_equal(result.episodes[0].actions, np.zeros((10, 12)))
+    with pytest.raises(ValueError, match=r"expected \[\.\.\., 101\] of task 'stand'"):
+        rehearse(path, task="hurdles", episodes=1, config=SHORT)
+
+
+def test_bad_requests_are_refused() -> None:
+    with pytest.raises(ValueError, match="cannot rehearse task 'imitate'; choose one of stand"):
+        rehearse(Constant(0.0), task="imitate")
+    with pytest.raises(ValueError, match="the policy does not name its task"):
+        rehearse(Constant(0.0))
+    with pytest.raises(ValueError, match="episodes must be at least 1, got 0"):
+        rehearse(Constant(0.0), task="stand", episodes=0)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"sim_dt": 0.003}, "does not divide the control step"),
+        ({"latency_ms": -1.0}, r"in \[0, 200\], got -1.0"),
+        ({"full_torque_speed": 30.0}, r"below no_load_speed 21\.0"),
+        ({"rate_noise": -0.1}, "rate_noise must not be negative"),
+    ],
+)
+def test_bad_settings_are_refused(changes: dict[str, float], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        dataclasses.replace(RehearsalConfig(), **changes)
