@@ -48,7 +48,7 @@ def read_rows(run_dir: Path) -> list[dict[str, str]]:
 def test_rows_are_tidy(tmp_path: Path, clock: FakeTime) -> None:
     with make_logger(tmp_path) as logger:
         clock.now += 2.5
-        logger.log(100, 200, {"return": np.float32(1.25), "reward/upright": 0.5})
+        logger.log(100, 200, {"return": np.float32(1.25), "world/upright": 0.5})
     rows = read_rows(tmp_path)
     assert tuple(rows[0]) == COLUMNS
     by_name = {row["metric"]: row for row in rows}
@@ -78,21 +78,34 @@ def test_rows_are_on_disk_before_the_run_ends(tmp_path: Path) -> None:
     logger.close()
 
 
+def values_of(run_dir: Path, metric: str) -> list[float]:
+    return [float(row["value"]) for row in read_rows(run_dir) if row["metric"] == metric]
+
+
 def test_compilation_is_announced_and_not_in_the_rates(tmp_path: Path, clock: FakeTime) -> None:
     text = io.StringIO()
     with make_logger(tmp_path, text) as logger:
         with logger.compiling("train_epoch"):
             clock.now += 23.0
-        clock.now += 2.0
         logger.log(100, 50, {})
         clock.now += 4.0
         logger.log(200, 150, {})
     assert "compiling train_epoch ...\n" in text.getvalue()
     assert "compiling train_epoch ... 23 s\n" in text.getvalue()
-    rates = [float(r["value"]) for r in read_rows(tmp_path) if r["metric"] == "env_steps_per_s"]
-    assert rates == pytest.approx([50.0, 25.0])
-    compile_s = [float(r["value"]) for r in read_rows(tmp_path) if r["metric"] == "compile_s"]
-    assert compile_s == pytest.approx([23.0])
+    assert values_of(tmp_path, "env_steps_per_s") == pytest.approx([25.0])
+    assert values_of(tmp_path, "updates_per_s") == pytest.approx([25.0])
+    assert values_of(tmp_path, "compile_s") == pytest.approx([23.0])
+    assert "eta 0:00:32" in text.getvalue()  # 800 steps at 25 a second
+
+
+def test_evaluation_time_is_not_in_the_rates(tmp_path: Path, clock: FakeTime) -> None:
+    with make_logger(tmp_path) as logger:
+        clock.now += 2.0
+        with logger.aside("evaluating ..."):
+            clock.now += 50.0
+        logger.log(100, 50, {})
+    assert values_of(tmp_path, "env_steps_per_s") == pytest.approx([50.0])
+    assert values_of(tmp_path, "compile_s") == []
 
 
 def test_resume_drops_rows_after_the_checkpoint(tmp_path: Path, clock: FakeTime) -> None:
@@ -101,7 +114,9 @@ def test_resume_drops_rows_after_the_checkpoint(tmp_path: Path, clock: FakeTime)
             clock.now += 10.0
             logger.log(steps, 2 * steps, {"q_mean": steps})
     path = tmp_path / "metrics.csv"
-    path.write_text(path.read_text() + "biped-0,biped,none,twirl,0,q,150,3")  # cut off by a crash
+    path.write_text(
+        path.read_text() + "biped-0,biped,none,twirl,0,q_mean,150,3"
+    )  # cut off by a crash
     clock.now += 1000.0
     with make_logger(tmp_path, resume_env_steps=200) as logger:
         clock.now += 5.0
@@ -129,8 +144,8 @@ def test_unknown_names_are_refused(tmp_path: Path) -> None:
     with make_logger(tmp_path) as logger:
         with pytest.raises(ValueError, match=r"unknown metric 'critic_los'.*'critic_loss'"):
             logger.log(1, 1, {"critic_los": 1.0})
-        with pytest.raises(ValueError, match="unknown metric 'reward/'"):
-            logger.log(1, 1, {"reward/": 1.0})
+        with pytest.raises(ValueError, match="unknown metric 'world/'"):
+            logger.log(1, 1, {"world/": 1.0})
     assert read_rows(tmp_path) == []
     with pytest.raises(ValueError, match="identity needs exactly"):
         RunLogger(tmp_path, {"run": "x"}, 1, "train")
@@ -145,6 +160,13 @@ def test_every_metric_is_described() -> None:
         assert describe(name) is info
     assert describe("eval/return").description.startswith("the metric after the slash")
     assert "`eval/<name>`" in table
+
+
+def test_every_measure_of_an_episode_is_a_metric() -> None:
+    from twirl_mjx.evaluation.measures import MEASURES
+
+    for task, measures in MEASURES.items():
+        assert set(measures) <= set(METRICS), task
 
 
 def test_plain_lines_tell_the_state(tmp_path: Path, clock: FakeTime) -> None:
@@ -182,7 +204,7 @@ def test_tensorboard_gets_the_same_values(tmp_path: Path) -> None:
     files = list((tmp_path / module.TENSORBOARD_DIR).glob("events.*"))
     assert len(files) == 1
     content = files[0].read_bytes()
-    assert b"q" in content
+    assert b"q_mean" in content
     assert b"return" not in content
     assert np.float32(2.5).tobytes() in content
 

@@ -46,52 +46,62 @@ class MetricInfo(NamedTuple):
 
 
 METRICS: dict[str, MetricInfo] = {
-    # Episodes that ended during the epoch, exploring policy.
-    "return": MetricInfo("mean undiscounted return of the episodes that ended", "1"),
-    "episode_length": MetricInfo("mean length of the episodes that ended", "control steps"),
-    "episodes": MetricInfo("episodes that ended", "1"),
-    "terminated_share": MetricInfo("share of ended episodes that failed (no time limit)", "1"),
-    "reward": MetricInfo("mean reward of one transition", "1"),
+    # Means over the episodes that ended during the epoch, exploring policy.
+    "return": MetricInfo("undiscounted return of an episode", "1"),
+    "episode_length": MetricInfo("control steps of an episode", "control steps"),
+    "episodes": MetricInfo("number of episodes that ended in the epoch", "1"),
+    "terminated": MetricInfo("share of episodes the task ended, not the time limit", "share"),
+    "success": MetricInfo("share of episodes that met the task's success criterion", "share"),
     "standing_time": MetricInfo(
-        "mean time per episode with upright cosine c >= 0.7 and both front feet off the ground", "s"
+        "time per episode with upright cosine c >= 0.7 and both front feet off the ground", "s"
     ),
-    "min_distance": MetricInfo("mean over episodes of the smallest distance to the goal", "m"),
-    "hurdles_passed": MetricInfo("mean number of hurdles passed per episode", "1"),
-    "clean_clearances": MetricInfo("mean number of hurdles cleared in one flight phase", "1"),
-    "forward_speed": MetricInfo("mean speed of the base along world x", "m/s"),
-    # Learner, mean over the critic updates (or actor updates) of the epoch.
-    "critic_loss": MetricInfo("mean squared TD error over ensemble and rows", "1"),
-    "actor_loss": MetricInfo("mean of temperature * log_prob - mean critic value", "1"),
-    "temperature_loss": MetricInfo("mean of temperature * (entropy - target entropy)", "1"),
-    "temperature": MetricInfo("SAC's alpha, the weight of the entropy", "1"),
-    "entropy": MetricInfo("policy entropy estimated by -log_prob of sampled actions", "nat"),
-    "q_mean": MetricInfo("mean critic value of the minibatch actions", "1"),
-    "target_q_mean": MetricInfo("mean TD target", "1"),
-    "q_max": MetricInfo("largest critic value in a minibatch", "1"),
-    "critic_grad_norm": MetricInfo("Euclidean norm of the critic gradient", "1"),
-    "actor_grad_norm": MetricInfo("Euclidean norm of the actor gradient", "1"),
-    # Bookkeeping.
-    "env_steps_per_s": MetricInfo("transitions per second, compilation excluded", "1/s"),
-    "updates_per_s": MetricInfo("critic updates per second, compilation excluded", "1/s"),
-    "replay_ratio": MetricInfo("rows the critic learned from per transition, utd * batch", "1"),
-    "online_rows": MetricInfo("filled rows of the online ring", "1"),
-    "source_rows": MetricInfo("filled rows of the source ring", "1"),
+    "cosine": MetricInfo("upright cosine c, vertical part of the base x-axis", "1"),
+    "min_distance": MetricInfo("closest approach to the goal in an episode", "m"),
+    "tracking": MetricInfo("imitation reward over its maximum", "1"),
+    "leaps": MetricInfo("leap cycles completed in an episode", "1"),
+    "hurdles_passed": MetricInfo("hurdles passed in an episode", "1"),
+    "clean_clearances": MetricInfo("hurdles passed in a single flight phase", "1"),
+    "hit_hurdle": MetricInfo("share of episodes ended by touching a hurdle", "share"),
+    "fall": MetricInfo("share of episodes ended by a fall", "share"),
+    "distance_x": MetricInfo("way made along x in an episode", "m"),
+    # Means over the transitions of the epoch.
+    "reward": MetricInfo("reward of one transition", "1"),
     "dropped_transitions": MetricInfo(
         "transitions dropped because a state, observation, reward or action was not finite", "1"
     ),
-    "compile_s": MetricInfo("time spent compiling since the last row", "s"),
+    # Means over the critic updates (or actor updates) of the epoch.
+    "critic_loss": MetricInfo("squared TD error, mean over ensemble and rows", "1"),
+    "actor_loss": MetricInfo("temperature * log_prob - mean critic value", "1"),
+    "temperature_loss": MetricInfo("temperature * (entropy - target entropy)", "1"),
+    "temperature": MetricInfo("SAC's alpha, the weight of the entropy", "1"),
+    "entropy": MetricInfo("policy entropy, -log_prob of sampled actions", "nat"),
+    "q_mean": MetricInfo("critic value of the minibatch actions", "1"),
+    "target_q_mean": MetricInfo("TD target", "1"),
+    "critic_grad_norm": MetricInfo("Euclidean norm of the critic gradient", "1"),
+    # Bookkeeping.
+    "env_steps_per_s": MetricInfo(
+        "transitions per second; undefined for an epoch with a compilation", "1/s"
+    ),
+    "updates_per_s": MetricInfo(
+        "critic updates per second; undefined for an epoch with a compilation", "1/s"
+    ),
+    "replay_ratio": MetricInfo("replayed rows per transition, utd * batch size", "1"),
+    "source_rows": MetricInfo("filled rows of the source ring", "1"),
+    "online_rows": MetricInfo("filled rows of the online ring", "1"),
+    "compile_s": MetricInfo("time spent compiling (and running once) in the epoch", "s"),
 }
 """The one table of metric names; the documentation is generated from it."""
 
 FAMILIES: dict[str, MetricInfo] = {
-    "reward/": MetricInfo("mean per transition of one unweighted reward term", "1"),
     "eval/": MetricInfo(
         "the metric after the slash, over evaluation episodes on separate seeds with the "
         "deterministic policy",
         "as named",
     ),
-    "termination/": MetricInfo("share of ended episodes that ended by this cause", "1"),
-    "world/": MetricInfo("mean over transitions of a task's per-world metric", "as in the task"),
+    "world/": MetricInfo(
+        "mean per transition of what the task reports: unweighted reward terms and measures",
+        "as in the task",
+    ),
 }
 """Prefixes under which a task or an evaluation may add names of its own."""
 
@@ -198,7 +208,7 @@ class RunLogger:
             self._sync()
         self._board = _open_board(run_dir, resume_env_steps) if tensorboard else None
         self._start = time.monotonic() - earlier
-        self._compile_s = 0.0
+        self._compile_s = self._aside_s = 0.0
         self._last = (resume_env_steps, 0, time.monotonic()) if not resume_env_steps else None
         self._view = ProgressView(console or Console(), stage, self._identity[0], total_env_steps)
         self._view.start(resume_env_steps)
@@ -244,20 +254,32 @@ class RunLogger:
 
     @contextlib.contextmanager
     def compiling(self, name: str) -> Iterator[None]:
-        """Announce a compilation, show its running time and leave it out of the rates.
+        """Announce a compilation and show its running time; its epoch gets no rates.
 
         Args:
             name: function being compiled, for example ``train_epoch``.
         """
         start = time.monotonic()
-        self._view.busy(f"compiling {name} ...")
+        with self.aside(f"compiling {name} ..."):
+            yield
+        elapsed = time.monotonic() - start
+        self._compile_s += elapsed
+        self._view.announce(f"compiling {name} ... {elapsed:.0f} s")
+
+    @contextlib.contextmanager
+    def aside(self, text: str) -> Iterator[None]:
+        """Show that something other than training goes on and leave its time out of the rates.
+
+        Args:
+            text: what goes on, for example ``evaluating ...``.
+        """
+        start = time.monotonic()
+        self._view.busy(text)
         try:
             yield
         finally:
-            elapsed = time.monotonic() - start
-            self._compile_s += elapsed
+            self._aside_s += time.monotonic() - start
             self._view.busy(None)
-            self._view.announce(f"compiling {name} ... {elapsed:.0f} s")
 
     def close(self) -> None:
         """Close files and display; harmless when repeated."""
@@ -274,16 +296,19 @@ class RunLogger:
         os.fsync(self._file.fileno())
 
     def _rates(self, env_steps: int, grad_steps: int) -> dict[str, float]:
-        """Return the rates since the last call; none on the first call after a resume."""
-        now, compile_s = time.monotonic(), self._compile_s
-        last, self._last, self._compile_s = self._last, (env_steps, grad_steps, now), 0.0
-        rates = {"compile_s": compile_s} if compile_s else {}
-        if last is None:
-            return rates
-        seconds = max(now - last[2] - compile_s, 1e-9)
-        rates["env_steps_per_s"] = (env_steps - last[0]) / seconds
-        rates["updates_per_s"] = (grad_steps - last[1]) / seconds
-        return rates
+        """Return the rates since the last call, or the compilation time if there was one."""
+        now, compile_s, aside_s = time.monotonic(), self._compile_s, self._aside_s
+        last, self._last = self._last, (env_steps, grad_steps, now)
+        self._compile_s = self._aside_s = 0.0
+        if compile_s:
+            return {"compile_s": compile_s}
+        seconds = 0.0 if last is None else now - last[2] - aside_s
+        if last is None or seconds <= 0.0:
+            return {}
+        return {
+            "env_steps_per_s": (env_steps - last[0]) / seconds,
+            "updates_per_s": (grad_steps - last[1]) / seconds,
+        }
 
 
 def _open_board(run_dir: Path, resume_env_steps: int) -> Any:

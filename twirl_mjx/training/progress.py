@@ -122,6 +122,8 @@ class ProgressView:
         """Take over one epoch."""
         self._env_steps, self._grad_steps = snapshot.env_steps, snapshot.grad_steps
         self._values |= {k: v for k, v in snapshot.values.items() if not math.isnan(v)}
+        if "compile_s" in snapshot.values:  # says nothing about the epochs to come
+            self._history.clear()
         self._history.append((time.monotonic(), snapshot.env_steps))
         if self._live is None:
             self.announce(self.line())
