@@ -4,8 +4,11 @@ import csv
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
+import imageio.v2 as imageio
 import numpy as np
 import pytest
+
+from twirl_mjx.figures.report import Media, write_report
 
 CURVES = ["run", "task", "shift", "variant", "seed", "metric", "env_steps", "grad_steps"]
 CURVES += ["wall_s", "value"]
@@ -31,7 +34,9 @@ def write_csv(path: Path, columns: Iterable[str], rows: Iterable, notes: Iterabl
     return path
 
 
-def curve_rows(task, shift, variant, seed, *, steps=100_000, points=21, level=None, extra=()):
+def curve_rows(
+    task, shift, variant, seed, *, steps=100_000, points=21, level=None, extra=(), standing=False
+):
     """Rows of one run whose return rises to `level`; untrained variants have one row."""
     words = (task, shift, variant, *extra)
     rng = np.random.default_rng([seed, *map(ord, "".join(map(str, words)))])
@@ -43,10 +48,10 @@ def curve_rows(task, shift, variant, seed, *, steps=100_000, points=21, level=No
         growth = 1.0 if untrained else 0.1 + 0.9 * (1 - np.exp(-4 * x))
         value = scale * (level * growth + 0.06 * rng.normal())
         at = round(steps * x)
-        row = [run, task, shift, variant, seed, "return", at, 20 * at, 0.01 * at, value]
-        yield [*row, *extra]
-        standing = max(0.0, 14 * level * growth + 0.5 * rng.normal())
-        yield [*row[:5], "standing_time", *row[6:9], standing, *extra]
+        identity, at_step = [run, task, shift, variant, seed], [at, 20 * at, 0.01 * at]
+        yield [*identity, "return", *at_step, value, *extra]
+        if standing:
+            yield [*identity, "standing_time", *at_step, 14 * level * growth, *extra]
 
 
 def episode_rows(task, shift, variant, seed, *, episodes=12):
@@ -58,34 +63,35 @@ def episode_rows(task, shift, variant, seed, *, episodes=12):
         yield [*row, "success", float(rng.random() < level)]
 
 
-def fill_results(root: Path, *, seeds=(0, 1, 2), steps=100_000) -> Path:
+def fill_results(
+    root: Path, *, tasks=("biped", "hurdles"), shifts=SHIFTS, seeds=(0, 1, 2), points=21
+) -> Path:
     """Write a table for every grid of the paper, and an evaluation."""
-    reduced = [f"reduced: {steps // 1000}k of 1M transitions, {len(seeds)} seeds"]
-    for task in ("biped", "hurdles"):
+    notes = [f"reduced: 100k of 1M transitions, {len(seeds)} seeds"]
+
+    def arm(grid, name, cells, columns=CURVES, **options):
+        rows = [
+            r for t, shift, v in cells for s in seeds for r in curve_rows(t, shift, v, s, **options)
+        ]
+        command = f"command: make sweep GRID={grid} ARGS=--only={name}"
+        write_csv(root / grid / f"{name}.csv", columns, rows, [*notes, command])
+
+    for task in tasks:
         for variant in ("scratch", "twirl", "source"):
-            rows = [r for s in seeds for r in curve_rows(task, "none", variant, s, steps=steps)]
-            notes = [*reduced, f"command: make sweep GRID=tasks ARGS=--only={task}-{variant}"]
-            write_csv(root / "tasks" / f"{task}-{variant}.csv", CURVES, rows, notes)
+            cells, standing = [(task, "none", variant)], task == "biped"
+            arm("tasks", f"{task}-{variant}", cells, points=points, standing=standing)
         for variant in ("twirl", "twirl+weights", "weights", "zero-shot"):
-            for shift in SHIFTS:
-                rows = [r for s in seeds for r in curve_rows(task, shift, variant, s, steps=steps)]
-                write_csv(root / "shifts" / f"{task}-{shift}-{variant}.csv", CURVES, rows, reduced)
-            rows = [
-                r
-                for shift in ("none", *SHIFTS)
-                for s in seeds
-                for r in episode_rows(task, shift, variant, s)
-            ]
+            cells = [(task, shift, variant) for shift in shifts]
+            arm("shifts", f"{task}-{variant}", cells, points=points)
+            cells = [(task, shift, variant, seed) for shift in ("none", *shifts) for seed in seeds]
+            rows = [r for cell in cells for r in episode_rows(*cell)]
             write_csv(root / "evaluation" / f"{task}-{variant}.csv", EPISODES, rows)
-        for grid, values in (("phi", (0, 0.25, 0.5, 0.75)), ("utd", (1, 5, 10, 20))):
-            for i, value in enumerate(values):
-                setting = {"level": 0.4 + 0.2 * i - 0.05 * i**2, "extra": (value,)}
-                rows = [
-                    r
-                    for s in seeds
-                    for r in curve_rows(task, "icy", "twirl", s, steps=steps, **setting)
-                ]
-                write_csv(root / grid / f"{task}-{value}.csv", [*CURVES, grid], rows, reduced)
+    for grid, values in (("phi", (0, 0.25, 0.5, 0.75)), ("utd", (1, 5, 10, 20))):
+        for i, value in enumerate(values):
+            level = 0.4 + 0.2 * i - 0.05 * i**2
+            options = {"level": level, "extra": (value,), "points": points}
+            cells = [(tasks[0], "icy", "twirl")]
+            arm(grid, f"{tasks[0]}-{value}", cells, [*CURVES, grid], **options)
     return root
 
 
@@ -108,4 +114,28 @@ def episodes_of() -> Callable:
 @pytest.fixture(scope="session")
 def results(tmp_path_factory) -> Path:
     """A results directory with every grid (read-only by agreement)."""
-    return fill_results(tmp_path_factory.mktemp("results"))
+    root = tmp_path_factory.mktemp("results")
+    return fill_results(root, shifts=("icy", "gravity"), seeds=(0, 1), points=6)
+
+
+@pytest.fixture(scope="session")
+def report_file(results, tmp_path_factory) -> Path:
+    """A report of one task and its evaluation, with a clip and a picture."""
+    root = tmp_path_factory.mktemp("report")
+    for name in ("scratch", "twirl", "source"):
+        source = results / "tasks" / f"biped-{name}.csv"
+        lines = [line for line in source.read_text().splitlines() if "standing_time" not in line]
+        (root / "results" / "tasks").mkdir(parents=True, exist_ok=True)
+        (root / "results" / "tasks" / source.name).write_text("\n".join(lines) + "\n")
+    for name in ("twirl", "zero-shot"):
+        rows = episode_rows("biped", "icy", name, 0)
+        write_csv(root / "results" / "evaluation" / f"biped-{name}.csv", EPISODES, rows)
+    with imageio.get_writer(root / "walk.mp4", fps=20) as writer:
+        for i in range(5):
+            writer.append_data(np.full((48, 64, 3), 40 * i, np.uint8))  # pyright: ignore
+    imageio.imwrite(root / "scene.png", np.full((40, 60, 3), 128, np.uint8))
+    clip = Media(
+        root / "walk.mp4", "Biped walks", "A robot on its hind legs", "make render TASK=biped"
+    )
+    media = [clip, root / "scene.png"]
+    return write_report(root / "results", root / "report.html", media, say=lambda line: None)

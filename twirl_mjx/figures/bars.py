@@ -167,7 +167,7 @@ def ablation(
             right.set_title(f"after {short_count(ends[key])} transitions")
             _draw_points(frame, right, part, column, statistic, ends[key])
             right.set_xlabel(_AXIS_NAMES[column])
-        frame.captions.append(BANDS[statistic])
+        frame.captions.append(f"{BANDS[statistic]} Points and whiskers on the right: the same.")
     return frame.figure
 
 

@@ -168,7 +168,7 @@ STYLE = """
 * { box-sizing: border-box; }
 body { margin: 0; background: var(--page); color: var(--text);
   font: 16px/1.55 system-ui, -apple-system, "Segoe UI", Roboto, "DejaVu Sans", sans-serif; }
-header, main, footer { max-width: 1120px; margin: 0 auto; padding: 0 20px; }
+header, main, footer { max-width: 1240px; margin: 0 auto; padding: 0 20px; }
 header { padding-top: 36px; }
 h1 { font-size: 1.9rem; line-height: 1.2; margin: 0 0 6px; }
 h2 { font-size: 1.3rem; margin: 0 0 4px; }
@@ -193,10 +193,10 @@ figure img, figure video { display: block; max-width: 100%; height: auto; border
 .clips img, .clips video { width: 100%; background: #000; }
 figcaption { font-size: 0.88rem; margin-top: 6px; }
 .scroll { overflow-x: auto; margin: 12px 0; }
-table { border-collapse: collapse; font-size: 0.86rem; width: 100%;
+table { border-collapse: collapse; font-size: 0.86rem; min-width: 60%;
   font-variant-numeric: tabular-nums; }
 caption { text-align: left; padding: 4px 0 8px; }
-th, td { padding: 6px 10px; border-bottom: 1px solid var(--line); text-align: left;
+th, td { padding: 5px 9px; border-bottom: 1px solid var(--line); text-align: left;
   white-space: nowrap; vertical-align: baseline; }
 thead th { border-bottom: 2px solid var(--line); font-weight: 600; }
 tbody th { font-weight: 600; }
@@ -204,9 +204,11 @@ tbody tr:hover { background: var(--code); }
 th:first-child, td:first-child { padding-left: 0; }
 .number { text-align: right; }
 .best { font-weight: 700; }
+.bounds { display: block; color: var(--quiet); font-size: 0.92em; font-weight: 400; }
+.commands { white-space: normal; min-width: 250px; }
 code { font: 0.92em ui-monospace, "DejaVu Sans Mono", Menlo, Consolas, monospace;
   background: var(--code); padding: 1px 5px; border-radius: 4px; }
-.command { user-select: all; }
+.command { user-select: all; overflow-wrap: anywhere; }
 details { margin: 10px 0; }
 summary { cursor: pointer; color: var(--accent); font-weight: 600; }
 dt { font-weight: 600; } dd { margin: 0 0 8px; max-width: 80ch; }

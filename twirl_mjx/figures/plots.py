@@ -12,6 +12,7 @@ from twirl_mjx.figures.aggregate import statistics_of
 from twirl_mjx.figures.bars import ablation, shift_bars
 from twirl_mjx.figures.canvas import write_png
 from twirl_mjx.figures.curves import learning_curves
+from twirl_mjx.figures.style import metric_info
 from twirl_mjx.figures.summary import grid_kind, main_metric, shown_metrics
 from twirl_mjx.figures.tables import Table, TableError, read_directory
 
@@ -80,7 +81,7 @@ def drawings(
     """Yield the figures of one grid.
 
     Every grid has its main metric in the paper's style and with IQM; `tasks` and grids of your
-    own have curves of every metric with a written name; episode tables become bars.
+    own have curves of every headline metric; episode tables become bars.
 
     Args:
         grid: Name of the grid; its first word says what kind it is.
@@ -96,7 +97,7 @@ def drawings(
         if table is None:
             continue
         main = metric or main_metric(table)
-        every = shown_metrics(table, main)
+        every = [m for m in shown_metrics(table, main) if _is_drawn(m, main)]
         if table.is_episodes:
             wanted = [("bars", name) for name in every]
         elif kind in ("phi", "utd"):
@@ -149,6 +150,10 @@ def _drawing(
         return function(table, metric, statistic=statistic, theme=theme)
 
     return Drawing(name, kind, metric, statistic, table, draw)
+
+
+def _is_drawn(metric: str, main: str) -> bool:
+    return metric == main or metric_info(metric).is_headline
 
 
 def _slug(metric: str) -> str:

@@ -36,6 +36,8 @@ _ABOUT = {
     "utd": "Critic updates per transition.",
 }
 
+_SHORT_TABLE = 12  # rows; a longer table of details is folded
+
 _TERMS = """<dl>
 <dt>IQM [95 %]</dt><dd>Interquartile mean over seeds (or episodes): the mean without the lowest and
 highest quarter; the plain mean below four samples, and for rates such as success. In brackets the
@@ -167,7 +169,7 @@ def _figure(drawing: Drawing, part: Part) -> str:
     light, dark = (png_bytes(drawing.draw(theme)) for theme in ("light", "dark"))
     info = metric_info(drawing.metric)
     parts = [
-        f"{_place(s)}: {s.label} {_interval(s.robust)}" for s in part.summaries[drawing.metric]
+        f"{_place(s)}: {s.label} {interval_text(s.robust)}" for s in part.summaries[drawing.metric]
     ]
     kind = {"curves": "Learning curves", "bars": "Bars", "ablation": "Ablation"}[drawing.kind]
     unit = f" in {info.unit}" if info.unit else ""
@@ -181,7 +183,7 @@ def _findings(part: Part) -> str:
     lines = []
     if kind == "tasks":
         lines = [
-            f"{_place(s)}: TWiRL has {_interval(s.ratio)} times the {name} of learning from scratch"
+            f"{_place(s)}: TWiRL has {interval_text(s.ratio)} times the {name} of scratch"
             for s in rows
             if s.variant == "twirl" and s.ratio and not np.isnan(s.ratio.estimate)
         ]
@@ -196,32 +198,35 @@ def _findings(part: Part) -> str:
         for place in dict.fromkeys(_place(s) for s in rows):
             best = max((s for s in rows if _place(s) == place), key=lambda s: s.robust.estimate)
             value = f"{best.settings.get(kind, float('nan')):g}"
-            lines.append(f"{place}: highest {name} at {kind} = {value}: {_interval(best.robust)}")
+            lines.append(
+                f"{place}: highest {name} at {kind} = {value}: {interval_text(best.robust)}"
+            )
     items = "".join(f"<li>{escape(line)}</li>" for line in lines)
     return f'<ul class="findings">{items}</ul>' if items else ""
 
 
 def _main_table(part: Part) -> str:
-    rows = part.summaries[part.main]
-    centre = "mean [95 %]" if metric_info(part.main).is_rate else "IQM [95 %]"
-    episodes = part.table.is_episodes
+    rows, baseline = part.summaries[part.main], baseline_of(part.grid)
+    info, episodes = metric_info(part.main), part.table.is_episodes
     header = ["task, shift", "variant", "seeds", *(["episodes"] if episodes else []), "transitions"]
     header += [] if episodes else ["updates", "wall time"]
-    header += ["mean ± std", centre, "ratio", "P(better)", "command"]
+    header += ["mean ± std", "mean [95 %]" if info.is_rate else "IQM [95 %]"]
+    header += ["ratio", "P(better)", "command"] if baseline else ["command"]
     lines = []
     for s in rows:
-        best = _is_best(s, rows, higher=metric_info(part.main).higher_is_better)
-        robust = escape(_interval(s.robust))
+        best = _is_best(s, rows, higher=info.higher_is_better)
         cells = [escape(_place(s)), escape(s.label), str(len(s.seeds))]
         cells += [str(s.samples)] if episodes else []
         cells += [short_count(s.env_steps)]
-        cells += [] if episodes else [short_count(s.grad_steps), _duration(s.wall_s)]
-        cells += [f"{_number(s.mean)} ± {_number(s.std)}"]
-        cells += [f'<span class="best">{robust}</span>' if best else robust]
-        cells += [_interval(s.ratio) if s.ratio else "", _interval(s.better) if s.better else ""]
-        cells += ["<br>".join(page.command(c) for c in _commands(part.grid, s))]
-        lines.append(cells)
-    against = ", ".join(f"{k} {v}" for k, v in baseline_of(part.grid).items())
+        cells += [] if episodes else [short_count(s.grad_steps), duration(s.wall_s)]
+        cells += [" ± ".join(numbers(s.mean, s.std)), _interval_html(s.robust, best=best)]
+        if baseline:
+            missing = "baseline" if s.matches(baseline) else "\N{EN DASH}"
+            pair = (s.ratio, s.better)
+            cells += [_interval_html(value) if value else missing for value in pair]
+        commands = "<br>".join(page.command(c) for c in _commands(part.grid, s))
+        lines.append([*cells, f'<div class="commands">{commands}</div>'])
+    against = ", ".join(f"{k} {v}" for k, v in baseline.items())
     caption = f"{metric_label(part.main)}. Bold: best of its task and shift."
     caption += f" Ratio and P(better) against {against}." if against else ""
     return page.table(caption, header, lines, numeric=range(2, len(header) - 1))
@@ -235,14 +240,17 @@ def _more_table(part: Part) -> str:
     cells: dict[tuple[str, str], dict[str, str]] = {}
     for metric in others:
         for s in part.summaries[metric]:
-            cells.setdefault((_place(s), s.label), {})[metric] = _interval(s.robust)
+            cells.setdefault((_place(s), s.label), {})[metric] = _interval_html(s.robust)
     lines = [
-        [escape(place), escape(label), *(escape(values.get(m, "")) for m in others)]
+        [escape(place), escape(label), *(values.get(m, "") for m in others)]
         for (place, label), values in cells.items()
     ]
     header = ["task, shift", "variant", *(metric_label(m) for m in others)]
-    caption = "Other metrics: IQM (mean for rates) with 95 % interval."
-    return page.table(caption, header, lines, numeric=range(2, len(header)))
+    body = page.table(
+        "IQM (mean for rates) with 95 % interval", header, lines, numeric=range(2, len(header))
+    )
+    opened = " open" if len(lines) <= _SHORT_TABLE else ""
+    return f"<details{opened}><summary>Other metrics</summary>{body}</details>"
 
 
 def _runs_table(part: Part) -> str:
@@ -256,8 +264,8 @@ def _runs_table(part: Part) -> str:
                 str(seed),
                 f"{int(rows['env_steps'].max()):,}",
                 f"{int(rows['grad_steps'].max()):,}",
-                _duration(float(rows["wall_s"].max())),
-                _number(float(rows["value"][last])),
+                duration(float(rows["wall_s"].max())),
+                numbers(float(rows["value"][last]))[0],
                 f"<code>{escape(f'{part.grid}/{arm}.csv')}</code>",
             ]
         )
@@ -286,25 +294,32 @@ def _place(summary: Summary) -> str:
     return summary.task if summary.shift == "none" else f"{summary.task}, {summary.shift}"
 
 
-def _interval(interval: Interval) -> str:
-    if np.isnan(interval.low):
-        return _number(interval.estimate)
-    low, high = _number(interval.low), _number(interval.high)
-    return f"{_number(interval.estimate)} [{low}, {high}]"
+def interval_text(interval: Interval) -> str:
+    """Write an interval as "2.9 [2.5, 3.4]", or without brackets where there are no bounds."""
+    centre, low, high = numbers(interval.estimate, interval.low, interval.high)
+    return centre if np.isnan(interval.low) else f"{centre} [{low}, {high}]"
 
 
-def _number(value: float) -> str:
-    if np.isnan(value):
-        return "\N{EN DASH}"
-    size = abs(value)
+def numbers(*values: float) -> list[str]:
+    """Write numbers with the digits that suit the largest; NaN is a dash."""
+    size = max((abs(value) for value in values if not np.isnan(value)), default=0.0)
     digits = 0 if size >= 100 else 1 if size >= 10 else 2
-    return f"{value:,.{digits}f}"
+    return ["\N{EN DASH}" if np.isnan(value) else f"{value:,.{digits}f}" for value in values]
 
 
-def _duration(seconds: float) -> str:
+def duration(seconds: float) -> str:
+    """Write a duration as "2 h 05 min", "17 min" or "42 s"; NaN is a dash."""
     if np.isnan(seconds):
         return "\N{EN DASH}"
+    if seconds < 60:
+        return f"{seconds:.0f} s"
     minutes = round(seconds / 60)
-    if minutes >= 60:
-        return f"{minutes // 60} h {minutes % 60:02d} min"
-    return f"{minutes} min" if minutes else f"{seconds:.0f} s"
+    return f"{minutes // 60} h {minutes % 60:02d} min" if minutes >= 60 else f"{minutes} min"
+
+
+def _interval_html(interval: Interval, *, best: bool = False) -> str:
+    centre, low, high = numbers(interval.estimate, interval.low, interval.high)
+    centre = f'<span class="best">{centre}</span>' if best else centre
+    if np.isnan(interval.low):
+        return centre
+    return f'{centre}<span class="bounds">[{low}, {high}]</span>'

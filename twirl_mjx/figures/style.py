@@ -33,17 +33,25 @@ class Metric:
     """Unit; empty for counts, shares and returns."""
     higher_is_better: bool = True
     """Direction of improvement."""
+    is_headline: bool = False
+    """Whether it has figures of its own; the others are in tables only."""
     is_rate: bool = False
     """Whether an episode has 0 or 1, so that quartiles mean nothing and the mean is shown."""
 
 
 METRICS = {
-    "return": Metric("return"),
-    "success": Metric("success rate", is_rate=True),
-    "standing_time": Metric("standing time", "s"),
-    "min_distance": Metric("minimum distance to goal", "m", higher_is_better=False),
-    "hurdles_passed": Metric("hurdles passed"),
-    "clean_clearances": Metric("hurdles cleared in one flight"),
+    "return": Metric("return", is_headline=True),
+    "success": Metric("success rate", is_headline=True, is_rate=True),
+    "standing_time": Metric("standing time", "s", is_headline=True),
+    "min_distance": Metric("minimum distance to goal", "m", False, is_headline=True),
+    "leaps": Metric("leap cycles", is_headline=True),
+    "tracking": Metric("share of the highest tracking reward"),
+    "hurdles_passed": Metric("hurdles passed", is_headline=True),
+    "clean_clearances": Metric("hurdles cleared in one flight", is_headline=True),
+    "hit_hurdle": Metric("hurdle hits per episode", "", False, is_rate=True),
+    "fall": Metric("falls per episode", "", False, is_rate=True),
+    "terminated": Metric("early ends per episode", "", False, is_rate=True),
+    "terminated_share": Metric("share of episodes ended early", "", False),
     "forward_speed": Metric("forward speed", "m/s"),
     "episode_length": Metric("episode length", "control steps"),
 }

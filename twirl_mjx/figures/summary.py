@@ -75,6 +75,10 @@ class Summary:
         """The cell in words, without task and shift."""
         return ", ".join([self.variant, *(f"{k} {v:g}" for k, v in self.settings.items())])
 
+    def matches(self, baseline: dict[str, object]) -> bool:
+        """Return whether the cell has the values (column = value) of a baseline."""
+        return {"variant": self.variant, **self.settings}.items() >= baseline.items()
+
 
 def baseline_of(grid: str) -> dict[str, object]:
     """Return what a grid's cells are compared with, as column = value; empty if nothing.

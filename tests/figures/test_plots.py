@@ -1,0 +1,226 @@
+import io
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from matplotlib.lines import Line2D
+from matplotlib.patches import Rectangle
+from PIL import Image
+
+from twirl_mjx.figures import canvas, plots, style, tables
+from twirl_mjx.figures.tables import TableError, read_table
+
+
+@pytest.fixture(scope="module")
+def made(results, tmp_path_factory):
+    said = []
+    output = tmp_path_factory.mktemp("figures")
+    return plots.make_figures(results, output, say=said.append), said
+
+
+@pytest.fixture
+def icy(tmp_path, write, rows_of):
+    """Two variants under one shift, two seeds each."""
+    rows = [
+        row for v in ("twirl", "weights") for s in (0, 1) for row in rows_of("biped", "icy", v, s)
+    ]
+    return read_table(write(tmp_path / "icy.csv", tables.CURVE_COLUMNS, rows, ["reduced: 2 seeds"]))
+
+
+def xdata(line: Line2D) -> np.ndarray:
+    return np.asarray(line.get_xdata())
+
+
+def ydata(line: Line2D) -> np.ndarray:
+    return np.asarray(line.get_ydata())
+
+
+def texts(figure):
+    found = [t.get_text() for t in figure.texts]
+    for axes in figure.axes:
+        found += [axes.get_title(loc="left"), axes.get_xlabel(), axes.get_ylabel()]
+        found += [t.get_text() for t in axes.get_xticklabels()]
+    return found + [t.get_text() for legend in figure.legends for t in legend.get_texts()]
+
+
+def test_every_grid_is_drawn(made):
+    paths, said = made
+    names = {path.stem for path in paths}
+    assert names == {
+        "tasks_curves_return_mean",
+        "tasks_curves_return_iqm",
+        "tasks_curves_standing_time_mean",
+        "tasks_curves_standing_time_iqm",
+        "shifts_bars_return_mean",
+        "shifts_bars_return_iqm",
+        "shifts_curves_return_mean",
+        "shifts_curves_return_iqm",
+        "phi_ablation_return_mean",
+        "phi_ablation_return_iqm",
+        "utd_ablation_return_mean",
+        "utd_ablation_return_iqm",
+        "evaluation_episodes_bars_return_mean",
+        "evaluation_episodes_bars_return_iqm",
+        "evaluation_episodes_bars_success_rate",
+    }
+    assert said == []
+
+
+def test_pictures_are_legible_in_size_and_not_blank(made):
+    for path in made[0]:
+        with Image.open(path) as picture:
+            pixels = np.asarray(picture.convert("RGB"))
+        assert pixels.shape[1] >= 700, path
+        assert (pixels != 255).any(axis=-1).mean() > 0.02, path
+
+
+def test_grids_without_data_are_named(tmp_path, write, rows_of):
+    write(tmp_path / "tasks" / "a.csv", tables.CURVE_COLUMNS, rows_of("biped", "none", "twirl", 0))
+    write(tmp_path / "mine" / "a.csv", tables.CURVE_COLUMNS, [])
+    said = []
+    assert list(plots.read_grids(tmp_path, said.append)) == ["tasks"]
+    assert [line.split("'")[1] for line in said] == ["shifts", "phi", "utd", "mine"]
+    assert all("no data in" in line for line in said)
+    with pytest.raises(TableError, match=r"no such directory, expected <grid>/<arm>\.csv below it"):
+        plots.read_grids(tmp_path / "nowhere")
+
+
+def test_the_same_table_gives_the_same_bytes(icy):
+    def draw(theme):
+        return plots.learning_curves(icy, "return", statistic="iqm", theme=theme)
+
+    assert canvas.png_bytes(draw("light")) == canvas.png_bytes(draw("light"))
+    assert canvas.svg_bytes(draw("dark")) == canvas.svg_bytes(draw("dark"))
+
+
+def test_user_settings_of_matplotlib_change_nothing(icy):
+    import matplotlib
+
+    expected = canvas.png_bytes(plots.shift_bars(icy, "return"))
+    with matplotlib.rc_context({"font.size": 30, "axes.grid": False, "savefig.dpi": 20}):
+        assert canvas.png_bytes(plots.shift_bars(icy, "return")) == expected
+
+
+def test_a_curve_shows_the_mean_of_its_runs_in_the_colour_of_its_variant(icy):
+    (axes,) = plots.learning_curves(icy, "return", statistic="mean").axes
+    part = tables.select(icy, variant="weights", metric="return")
+    runs = [tables.select(part, seed=s)["value"] for s in (0, 1)]
+    colour = style.variant_mark("weights", style.theme_of("light")).colour
+    (line,) = [li for li in axes.lines if li.get_color() == colour and li.get_linewidth() > 1]
+    np.testing.assert_allclose(ydata(line), np.mean(runs, axis=0))
+    assert xdata(line)[-1] == 100_000
+
+
+def test_bars_show_the_last_values(icy):
+    (axes,) = plots.shift_bars(icy, "return", statistic="mean").axes
+    last = tables.select(icy, metric="return", env_steps=100_000)
+    expected = [tables.select(last, variant=v)["value"].mean() for v in ("twirl", "weights")]
+    np.testing.assert_allclose(
+        [bar.get_height() for bar in axes.patches if isinstance(bar, Rectangle)], expected
+    )
+
+
+def test_runs_can_be_set_side_by_side(icy):
+    (axes,) = plots.shift_bars(icy, "return", by="run").axes
+    assert len(axes.patches) == 4
+    with pytest.raises(ValueError, match="cannot draw one bar per 'seed'; "):
+        plots.shift_bars(icy, "return", by="seed")
+
+
+def test_untrained_variants_are_level_lines(tmp_path, write, rows_of):
+    rows = [r for v in ("scratch", "source") for r in rows_of("biped", "none", v, 0)]
+    table = read_table(write(tmp_path / "a.csv", tables.CURVE_COLUMNS, rows))
+    (axes,) = plots.learning_curves(table, "return").axes
+    colour = style.variant_mark("source", style.theme_of("light")).colour
+    (line,) = [li for li in axes.lines if li.get_color() == colour]
+    assert xdata(line).tolist() == [0, 100_000]
+    assert len(set(ydata(line).tolist())) == 1
+
+
+def test_reduced_results_say_so_in_the_picture(icy):
+    for figure in (plots.learning_curves(icy, "return"), plots.shift_bars(icy, "return")):
+        assert "Reduced: 2 seeds" in texts(figure)
+    whole = tables.Table(icy.columns, (), icy.source)
+    assert not any("educed" in text for text in texts(plots.learning_curves(whole, "return")))
+
+
+def test_ablation_has_one_line_and_one_point_per_value(tmp_path, write, rows_of):
+    rows = [
+        row
+        for utd in (1, 20)
+        for seed in (0, 1)
+        for row in rows_of("biped", "icy", "twirl", seed, extra=(utd,), level=utd / 20)
+    ]
+    columns = [*tables.CURVE_COLUMNS, "utd"]
+    table = read_table(write(tmp_path / "a.csv", columns, rows))
+    figure = plots.ablation(table, "utd", "return")
+    shown = texts(figure)
+    assert {"utd = 1", "utd = 20", "after 100k transitions", "biped, icy"} <= set(shown)
+    right = figure.axes[1]
+    assert [ydata(line)[0] for line in right.lines] == pytest.approx(
+        [
+            tables.select(table, metric="return", env_steps=100_000, utd=u)["value"].mean()
+            for u in (1, 20)
+        ]
+    )
+
+
+def test_unknown_names_are_refused_with_the_nearest(icy, tmp_path, write, rows_of):
+    with pytest.raises(TableError, match="metric 'retrun'; nearest valid: 'return'"):
+        plots.learning_curves(icy, "retrun")
+    with pytest.raises(ValueError, match="no theme 'drak'; nearest valid: 'dark'"):
+        plots.learning_curves(icy, "return", theme="drak")
+    with pytest.raises(ValueError, match="one line per 'varint'; nearest valid: 'variant'"):
+        plots.learning_curves(icy, "return", by="varint")
+    with pytest.raises(ValueError, match="no ablation of 'psi'; nearest valid: 'phi'"):
+        plots.ablation(icy, "psi", "return")
+    with pytest.raises(TableError, match="no column 'phi'"):
+        plots.ablation(icy, "phi", "return")
+    rows = [[*r[:2], "iccy", "twril", *r[4:]] for r in rows_of("biped", "icy", "twirl", 0)]
+    table = read_table(write(tmp_path / "typo.csv", tables.CURVE_COLUMNS, rows))
+    with pytest.raises(ValueError, match="no colour for variant 'twril'; nearest valid: 'twirl'"):
+        plots.learning_curves(table, "return")
+    with pytest.raises(ValueError, match=r"typo\.csv: unknown shift 'iccy'; nearest valid: 'icy'"):
+        plots.shift_bars(table, "return")
+
+
+def test_an_empty_setting_column_is_refused(tmp_path, write, rows_of):
+    rows = rows_of("biped", "icy", "twirl", 0, extra=("",))
+    table = read_table(write(tmp_path / "a.csv", [*tables.CURVE_COLUMNS, "phi"], rows))
+    with pytest.raises(TableError, match="column 'phi' is empty in every row"):
+        plots.ablation(table, "phi", "return")
+
+
+@pytest.mark.parametrize("theme", ["light", "dark"])
+def test_colours_differ_and_stand_out_from_the_background(theme):
+    def luminance(colour):
+        channels = [int(colour[i : i + 2], 16) / 255 for i in (1, 3, 5)]
+        linear = [c / 12.92 if c <= 0.03928 else ((c + 0.055) / 1.055) ** 2.4 for c in channels]
+        return np.dot(linear, [0.2126, 0.7152, 0.0722])
+
+    def contrast(a, b):
+        high, low = sorted((luminance(a), luminance(b)), reverse=True)
+        return (high + 0.05) / (low + 0.05)
+
+    look = style.theme_of(theme)
+    marks = [style.variant_mark(v, look) for v in style.VARIANTS]
+    assert len({m.colour for m in marks}) == len(marks)
+    assert len({m.hatch for m in marks}) == len(marks)
+    assert contrast(look.text, look.background) > 7
+    assert min(contrast(m.colour, look.background) for m in marks) > 2
+    assert len({style.ordered_mark(i, 4, look).colour for i in range(4)}) == 4
+
+
+def test_png_keeps_the_background_of_the_theme(icy):
+    for theme, rgb in (("light", (255, 255, 255)), ("dark", (22, 27, 34))):
+        picture = Image.open(
+            io.BytesIO(canvas.png_bytes(plots.shift_bars(icy, "return", theme=theme)))
+        )
+        assert picture.convert("RGB").getpixel((1, 1)) == rgb
+
+
+def test_figures_need_no_jax_and_no_simulator():
+    code = "import sys, twirl_mjx.figures.report; print({'jax', 'mujoco'} & set(sys.modules))"
+    shown = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert shown.stdout.strip() == "set()"
