@@ -24,6 +24,11 @@ from twirl_mjx.deploy.video import overlay_text, strip_indices, write_strip, wri
 GL_BACKENDS = ("egl", "osmesa")
 """Headless OpenGL backends in the order they are tried."""
 
+SHADOW_HALF_SIZE = 1.6
+"""m, half the edge of the square around the robot in which shadows are drawn."""
+LIGHT_DISTANCE = 4.0
+"""m, from the light to the robot."""
+
 GOAL_RGBA = (0.10, 0.65, 0.25, 0.9)
 _FIX = (
     "on Debian and Ubuntu: `apt-get install libegl1 libgl1-mesa-dri` (EGL) or "
@@ -130,6 +135,7 @@ class SceneRenderer:
         model.vis.global_.offwidth, model.vis.global_.offheight = width, height
         model.vis.quality.offsamples = 4 if antialias else 0
         model.vis.quality.shadowsize = 2048
+        model.vis.map.shadowclip = SHADOW_HALF_SIZE / model.stat.extent
         model.mat_reflectance[:] = 0.0  # a mirrored floor is a third of the drawing time
         self.model, self.data = model, mujoco.MjData(model)
         self._context = open_context(width, height)
@@ -167,6 +173,7 @@ class SceneRenderer:
         self.data.qpos[:] = qpos
         mujoco.mj_kinematics(self.model, self.data)
         mujoco.mj_comPos(self.model, self.data)
+        self._aim_lights(np.asarray(look_at))
         mujoco.mj_camlight(self.model, self.data)
         self._camera.lookat[:] = look_at
         self._camera.distance = view.distance
@@ -193,6 +200,12 @@ class SceneRenderer:
             self._gl.free()
             self._context.free()
             self._context = None
+
+    def _aim_lights(self, look_at: np.ndarray) -> None:
+        """Move the world's directional lights so that their shadow maps surround ``look_at``."""
+        directional = self.model.light_type == mujoco.mjtLightType.mjLIGHT_DIRECTIONAL.value
+        for i in np.flatnonzero(directional & (self.model.light_bodyid == 0)):
+            self.model.light_pos[i] = look_at - LIGHT_DISTANCE * self.model.light_dir[i]
 
     def _add_goal(self, goal: np.ndarray) -> None:
         """Put a disc and a pole at ``goal`` into the scene about to be drawn."""
