@@ -1,0 +1,158 @@
+"""The fast update is the plain one: same masks and noise in, same parameters out."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from twirl_mjx.config import DroqConfig
+from twirl_mjx.droq import dropout, fast, fused, learner, packing, plain
+from twirl_mjx.droq.state import CriticState
+
+OBS_SIZE, ACTION_SIZE, U = 5, 2, 4
+
+# Both forms do the same float32 arithmetic in another order; Adam divides small gradients by
+# their own size, so the relative error of a parameter is set by its step (1e-2), not its value.
+TOLERANCE = {"rtol": 1e-4, "atol": 2e-5}
+
+
+def plain_masks(masks):
+    """Turn masks [E, H, B] of the fast form into [E, B, H]."""
+    return [jnp.swapaxes(mask, 1, 2) for mask in masks]
+
+
+def assert_trees_close(actual, expected, **tolerance):
+    for (path, want), have in zip(
+        jax.tree_util.tree_leaves_with_path(expected), jax.tree.leaves(actual), strict=True
+    ):
+        assert have.dtype == want.dtype
+        np.testing.assert_allclose(
+            have, want, err_msg=jax.tree_util.keystr(path), **(tolerance or TOLERANCE)
+        )
+
+
+def critic_state(state):
+    return CriticState(state.critic, state.target_critic, state.critic_opt)
+
+
+@pytest.mark.parametrize(
+    ("hidden_sizes", "num_critics"), [((32, 16), 2), ((24,), 1), ((16, 20, 8), 3)]
+)
+def test_block_equals_explicit_plain_steps_with_the_same_masks(
+    small_config, transitions, hidden_sizes, num_critics
+):
+    config = dataclasses.replace(small_config, hidden_sizes=hidden_sizes, num_critics=num_critics)
+    keys = jax.random.split(jax.random.key(0), 4)
+    state = learner.init(keys[0], config, OBS_SIZE, ACTION_SIZE)
+    batch = transitions(keys[1], U, config.batch_size)
+    noise = jax.random.normal(keys[2], (U, config.batch_size, ACTION_SIZE))
+    temperature = jnp.float32(0.3)
+    block = jax.jit(fast.critic_block, static_argnums=3)
+    actual, metrics = block(
+        critic_state(state), state.actor, temperature, config, batch, noise, keys[3]
+    )
+
+    seeds = dropout.seeds(keys[3], (U, 2, len(hidden_sizes)))
+    step = jax.jit(plain.critic_step, static_argnums=3)
+    expected, history = critic_state(state), []
+    for i in range(U):
+        masks = [
+            plain_masks(
+                fused.ensemble_masks(
+                    seeds[i, j], num_critics, hidden_sizes, config.batch_size, config.dropout_rate
+                )
+            )
+            for j in range(2)
+        ]
+        minibatch = jax.tree.map(lambda x, i=i: x[i], batch)
+        expected, step_metrics = step(
+            expected, state.actor, temperature, config, minibatch, noise[i], keys[3], tuple(masks)
+        )
+        history.append(step_metrics)
+    assert_trees_close(actual, expected)
+    assert int(actual.critic_opt.count) == U
+    for name in metrics:
+        want = np.mean([float(m[name]) for m in history])
+        np.testing.assert_allclose(metrics[name], want, rtol=1e-4)
+    # The comparison is not between two states that never moved.
+    change = jax.tree.map(lambda a, b: float(jnp.abs(a - b).max()), actual.critic, state.critic)
+    assert min(jax.tree.leaves(change)) > 1e-3
+
+
+def test_action_gradient_of_q_equals_the_plain_one(small_config, transitions):
+    keys = jax.random.split(jax.random.key(1), 3)
+    state = learner.init(keys[0], small_config, OBS_SIZE, ACTION_SIZE)
+    batch = transitions(keys[1], small_config.batch_size)
+    seeds = dropout.seeds(keys[2], (2,))
+    masks = fused.ensemble_masks(
+        seeds, 2, small_config.hidden_sizes, small_config.batch_size, small_config.dropout_rate
+    )
+
+    def total(form, action, keep):
+        q = form.critic_q(state.critic, batch.obs, action, small_config, keys[2], keep)
+        return jnp.sum(jnp.sin(q)), q
+
+    gradient = jax.value_and_grad(total, argnums=1, has_aux=True)
+    (_, fast_q), fast_grad = gradient(fast, batch.action, masks)
+    (_, plain_q), plain_grad = gradient(plain, batch.action, plain_masks(masks))
+    np.testing.assert_allclose(fast_q, plain_q, rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(fast_grad, plain_grad, rtol=1e-4, atol=1e-5)
+    assert float(jnp.abs(plain_grad).min()) > 0
+
+
+def test_zero_preactivations_keep_their_gradient():
+    """A kept unit whose input is exactly 0 is not mistaken for a dropped one."""
+    z = jnp.zeros((1, 4, 3)).at[0, 2, :].set(1.0)
+    keep = jnp.ones_like(z, bool).at[0, 1, 0].set(False)
+    weight = jax.random.normal(jax.random.key(0), z.shape)
+
+    def by_hand(z):
+        kept = jnp.where(keep, z / 0.75, 0.0)
+        mean = kept.mean(1, keepdims=True)
+        std = jnp.sqrt(jnp.square(kept - mean).mean(1, keepdims=True) + 1e-6)
+        return jnp.sum(weight * jnp.maximum((kept - mean) / std + 1.0, 0.0))
+
+    def ours(z):
+        ones = jnp.ones((1, 4))
+        return jnp.sum(weight * fused.dropout_norm_relu(z, ones, ones, keep, 0.25))
+
+    np.testing.assert_allclose(ours(z), by_hand(z), rtol=1e-5)
+    grad = jax.grad(ours)(z)
+    np.testing.assert_allclose(grad, jax.grad(by_hand)(z), rtol=1e-4, atol=1e-5)
+    assert grad[0, 1, 0] == 0.0
+    assert float(jnp.abs(grad[0, 0]).min()) > 1e-3
+
+
+def test_transpose_in_blocks_is_a_transpose():
+    for shape in ((2, 32, 7), (1, 256, 256), (3, 20, 8)):
+        kernel = jax.random.normal(jax.random.key(0), shape)
+        np.testing.assert_array_equal(fused.transpose(kernel), kernel.transpose(0, 2, 1))
+
+
+def test_unpack_undoes_pack(small_config):
+    for hidden_sizes in ((32, 16), (8,), (16, 8, 4)):
+        config = dataclasses.replace(small_config, hidden_sizes=hidden_sizes, num_critics=3)
+        state = learner.init(jax.random.key(0), config, OBS_SIZE, ACTION_SIZE)
+        noisy = jax.tree.map(
+            lambda x: x + jax.random.normal(jax.random.key(x.size), x.shape), state.critic
+        )
+        packed = packing.pack(noisy, hidden_sizes)
+        assert_trees_close(packing.unpack(packed, hidden_sizes), noisy, rtol=0, atol=0)
+
+
+def test_bfloat16_products_stay_close_and_parameters_stay_float32(transitions):
+    config = DroqConfig(hidden_sizes=(32, 16), batch_size=8, matmul_dtype="bfloat16")
+    reference = dataclasses.replace(config, matmul_dtype="float32")
+    state = learner.init(jax.random.key(0), config, OBS_SIZE, ACTION_SIZE)
+    batch = transitions(jax.random.key(1), U, config.batch_size)
+    update = jax.jit(learner.update, static_argnums=1)
+    results = [update(state, c, batch, jax.random.key(2)) for c in (config, reference)]
+    # bfloat16 keeps 8 bits of each factor: 0.4 % each, less in the sum of 16 to 32 products.
+    assert_trees_close(results[0][1], results[1][1], rtol=0.05, atol=0.02)
+    assert jax.tree.map(lambda x: x.dtype, results[0][0]) == jax.tree.map(lambda x: x.dtype, state)
+    critic = [jax.tree.leaves(r[0].critic)[0] for r in results]
+    assert not np.array_equal(critic[0], critic[1])
