@@ -11,11 +11,10 @@ from typing import Any
 # that tests start, so they have to stand above every other import.
 os.environ["JAX_PLATFORMS"] = os.environ.get("TWIRL_TEST_PLATFORMS", "cpu")
 os.environ["MPLBACKEND"] = "Agg"
-_CACHE_ROOT = os.environ.get("TWIRL_CACHE_DIR") or os.path.join(
-    os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache", "twirl_mjx"
-)
-os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", os.path.join(_CACHE_ROOT, "jax"))
-os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.3")
+_CACHE = os.environ.get("TWIRL_CACHE_DIR", str(Path.home() / ".cache" / "twirl_mjx" / "jax"))
+if _CACHE != "off":  # the same place and rule as the command line's
+    os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", _CACHE)
+    os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.5")
 
 import jax
 import jax.numpy as jnp

@@ -32,6 +32,7 @@ ALLOWED: dict[str, set[str]] = {
     "deploy": ACTING | {"evaluation", "figures"},
     "figures": set(),
     "bench": ACTING | {"evaluation", "replay", "training", "deploy", "figures"},
+    "commands": ACTING | {"evaluation", "replay", "training", "deploy", "figures", "bench"},
 }
 """What each part may import of ours, besides itself; ``cli`` and the package root: everything."""
 
