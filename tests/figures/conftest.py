@@ -1,4 +1,4 @@
-"""Synthetic result tables. They are written below `tmp_path` only, never next to real results."""
+"""Synthetic result tables. They are written below ``tmp_path`` only, never next to real results."""
 
 import csv
 from collections.abc import Callable, Iterable
@@ -37,7 +37,7 @@ def write_csv(path: Path, columns: Iterable[str], rows: Iterable, notes: Iterabl
 def curve_rows(
     task, shift, variant, seed, *, steps=100_000, points=21, level=None, extra=(), standing=False
 ):
-    """Rows of one run whose return rises to `level`; untrained variants have one row."""
+    """Rows of one run whose return rises to ``level``; untrained variants have one row."""
     words = (task, shift, variant, *extra)
     rng = np.random.default_rng([seed, *map(ord, "".join(map(str, words)))])
     run = "-".join(map(str, (*words, seed)))

@@ -86,6 +86,14 @@ def test_episode_summaries_count_episodes(tmp_path, write, episodes_of):
     assert cell.robust.low < cell.mean < cell.robust.high
 
 
+def test_runs_can_be_summarised_side_by_side(table_of):
+    table = table_of(rows("twirl", [1, 5]))
+    assert [(s.variant, s.mean) for s in summary.summarise(table, "return", by="run")] == [
+        ("biped-none-twirl-0-()", 1.0),
+        ("biped-none-twirl-1-()", 5.0),
+    ]
+
+
 def test_shift_wins_counts_cells_that_hold_all_rivals(table_of):
     arms = []
     for shift, levels in {

@@ -16,8 +16,8 @@ from twirl_mjx.figures.style import SHIFTS, TASKS, VARIANTS, canonical, metric_i
 from twirl_mjx.figures.tables import Table, TableError, mask, nearest, select
 
 STATISTICS = ("mean", "iqm", "rate")
-"""What centre and bounds mean: `mean`: mean and standard deviation (paper style); `iqm`:
-interquartile mean and 95 % bootstrap interval; `rate`: mean and 95 % bootstrap interval."""
+"""What centre and bounds mean: ``mean``: mean and standard deviation (paper style); ``iqm``:
+interquartile mean and 95 % bootstrap interval; ``rate``: mean and 95 % bootstrap interval."""
 
 MAX_POINTS = 200
 """Points kept of a drawn curve."""
@@ -152,7 +152,7 @@ def curve(series: Sequence[Series], statistic: str) -> Curve:
 
     Args:
         series: Runs of one cell.
-        statistic: One of `STATISTICS`.
+        statistic: One of ``STATISTICS``.
     """
     axis = common_axis(series)
     values = np.stack([step_hold(s, axis) for s in series])
@@ -177,7 +177,7 @@ def common_end(table: Table) -> dict[tuple, int]:
 
 
 def final_values(series: Sequence[Series], env_steps: int) -> np.ndarray:
-    """Return the last value of each run measured by `env_steps`, [S].
+    """Return the last value of each run measured by ``env_steps``, [S].
 
     Raises:
         TableError: If a run was not measured by then.
@@ -196,7 +196,7 @@ def estimate(strata: Sequence[np.ndarray], statistic: str) -> Interval:
 
     Args:
         strata: Samples [n_k] per stratum.
-        statistic: One of `STATISTICS`.
+        statistic: One of ``STATISTICS``.
     """
     if check_statistic(statistic) != "mean":
         return bootstrap(strata, _BOOTSTRAPPED[statistic])
@@ -217,7 +217,7 @@ def cell_strata(table: Table, env_steps: int) -> list[np.ndarray]:
         [S] with a value per run.
 
     Raises:
-        TableError: If an episode appears twice or a run has no value by `env_steps`.
+        TableError: If an episode appears twice or a run has no value by ``env_steps``.
     """
     if table.is_episodes:
         return [_last_episodes(part) for part in groups(table, ["seed", "run"]).values()]
@@ -230,7 +230,7 @@ def statistics_of(metric: str) -> tuple[str, ...]:
 
 
 def check_statistic(statistic: str) -> str:
-    """Return the name if it is one of `STATISTICS`.
+    """Return the name if it is one of ``STATISTICS``.
 
     Raises:
         ValueError: If it is not.

@@ -88,10 +88,10 @@ def shift_bars(
 
     Args:
         table: Curve or episode rows.
-        metric: What to draw, for example `return`.
-        statistic: `iqm` or `rate` (with bootstrap interval) or `mean` (with standard deviation).
-        by: What a bar stands for: `variant`, or `run` to set runs side by side.
-        theme: `light` or `dark`.
+        metric: What to draw, for example ``return``.
+        statistic: ``iqm`` or ``rate`` (with bootstrap interval), ``mean`` (with deviation).
+        by: What a bar stands for: ``variant``, or ``run`` to set runs side by side.
+        theme: ``light`` or ``dark``.
 
     Raises:
         TableError: If the rows lack the metric or contradict themselves.
@@ -141,10 +141,10 @@ def ablation(
 
     Args:
         table: Curve rows with the column.
-        column: `phi` or `utd`.
-        metric: What to draw, for example `return`.
-        statistic: `iqm` or `rate` (with bootstrap interval) or `mean` (with standard deviation).
-        theme: `light` or `dark`.
+        column: ``phi`` or ``utd``.
+        metric: What to draw, for example ``return``.
+        statistic: ``iqm`` or ``rate`` (with bootstrap interval), ``mean`` (with deviation).
+        theme: ``light`` or ``dark``.
 
     Raises:
         TableError: If the rows lack the column or the metric, or contradict themselves.

@@ -57,11 +57,11 @@ def learning_curves(
 
     Args:
         table: Curve rows.
-        metric: What to draw, for example `return`.
-        statistic: `mean` (paper style, with standard deviation), `iqm` or `rate` (with a
+        metric: What to draw, for example ``return``.
+        statistic: ``mean`` (paper style, with standard deviation), ``iqm`` or ``rate`` (with a
             bootstrap band).
-        by: What a line stands for: `variant`, `phi` or `utd`.
-        theme: `light` or `dark`.
+        by: What a line stands for: ``variant``, ``phi`` or ``utd``.
+        theme: ``light`` or ``dark``.
 
     Raises:
         TableError: If the rows lack a column or the metric, or contradict themselves.
@@ -99,11 +99,11 @@ def draw_curves(frame: Canvas, axes: Axes, table: Table, *, statistic: str, by: 
         frame: The figure; its legend grows.
         axes: The panel.
         table: Rows of one metric, task and shift.
-        statistic: One of `aggregate.STATISTICS`.
-        by: `variant`, `phi` or `utd`.
+        statistic: One of ``aggregate.STATISTICS``.
+        by: ``variant``, ``phi`` or ``utd``.
 
     Raises:
-        ValueError: If `by` is unknown or a variant has no colour.
+        ValueError: If ``by`` is unknown or a variant has no colour.
         TableError: If the column is missing or a run contradicts itself.
     """
     marks = line_marks(table, by, frame.theme)
@@ -123,7 +123,7 @@ def line_marks(table: Table, by: str, theme: Theme) -> dict:
     """Return the look of every value of a column: fixed for variants, ordered for phi and utd.
 
     Raises:
-        ValueError: If `by` is unknown or a variant has no colour.
+        ValueError: If ``by`` is unknown or a variant has no colour.
         TableError: If the column is missing or empty.
     """
     if by not in BY:

@@ -51,7 +51,7 @@ class Media:
 
 
 def data_uri(content: bytes, kind: str) -> str:
-    """Return bytes as a `data:` address of a MIME type."""
+    """Return bytes as a ``data:`` address of a MIME type."""
     return f"data:{kind};base64,{base64.b64encode(content).decode('ascii')}"
 
 

@@ -1,4 +1,4 @@
-"""Rebuild every figure from `experiments/results/<grid>/*.csv`, and from nothing else."""
+"""Rebuild every figure from ``experiments/results/<grid>/*.csv``, and from nothing else."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ class Drawing:
     """A figure that can be drawn from a table."""
 
     name: str
-    """File name without ending, for example `phi_return_iqm`."""
+    """File name without ending, for example ``phi_return_iqm``."""
     kind: str
-    """`curves`, `bars` or `ablation`."""
+    """``curves``, ``bars`` or ``ablation``."""
     metric: str
     """Metric drawn."""
     statistic: str
-    """One of `aggregate.STATISTICS`."""
+    """One of ``aggregate.STATISTICS``."""
     table: Table
     """The rows."""
     draw: Callable[[str], Figure]
@@ -47,7 +47,7 @@ def read_grids(
     """Read every grid below a directory and say which of the paper's have no data.
 
     Args:
-        results_dir: `experiments/results`.
+        results_dir: ``experiments/results``.
         say: Called with one line per grid without data.
 
     Returns:
@@ -80,14 +80,14 @@ def drawings(
 ) -> Iterator[Drawing]:
     """Yield the figures of one grid.
 
-    Every grid has its main metric in the paper's style and with IQM; `tasks` and grids of your
+    Every grid has its main metric in the paper's style and with IQM; ``tasks`` and grids of your
     own have curves of every headline metric; episode tables become bars.
 
     Args:
         grid: Name of the grid; its first word says what kind it is.
         curves: Curve rows.
         episodes: Episode rows.
-        metric: Main metric; None for `summary.main_metric`.
+        metric: Main metric; None for ``summary.main_metric``.
 
     Raises:
         TableError: If the runs have no main metric in common.
@@ -121,13 +121,13 @@ def make_figures(
     """Draw every figure of every grid as PNG.
 
     Args:
-        results_dir: `experiments/results`, with `<grid>/<arm>.csv` below it.
+        results_dir: ``experiments/results``, with ``<grid>/<arm>.csv`` below it.
         output_dir: Directory of the pictures, made if needed.
-        metric: Main metric; None for `summary.main_metric`.
+        metric: Main metric; None for ``summary.main_metric``.
         say: Called with one line per grid without data.
 
     Returns:
-        The files written, `<output_dir>/<grid>_<kind>_<metric>_<statistic>.png`.
+        The files written, ``<output_dir>/<grid>_<kind>_<metric>_<statistic>.png``.
 
     Raises:
         TableError: If a table is not valid or lacks the main metric.

@@ -79,7 +79,7 @@ def write_report(
     """Write one self-contained page: findings, tables, curves and clips, no outside resources.
 
     Args:
-        results_dir: `experiments/results`, with `<grid>/<arm>.csv` below it.
+        results_dir: ``experiments/results``, with ``<grid>/<arm>.csv`` below it.
         output_path: The HTML file, replaced if it exists.
         media: Clips and pictures in the order of the page.
         title: Heading of the page.

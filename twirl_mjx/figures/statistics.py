@@ -38,7 +38,7 @@ class Interval:
 def iqm(samples: np.ndarray, axis: int = -1) -> np.ndarray:
     """Return the interquartile mean: the mean without the lowest and highest quarter.
 
-    The number cut at each end is floor(n / 4), as in `scipy.stats.trim_mean(samples, 0.25)`; so
+    The number cut at each end is floor(n / 4), as in ``scipy.stats.trim_mean(samples, 0.25)``; so
     fewer than four samples give the mean.
 
     Args:
@@ -125,7 +125,7 @@ def bootstrap_band(
         Lower and upper bound, [T] each; NaN for a single run.
 
     Raises:
-        ValueError: If `values` is not two-dimensional or a number is out of range.
+        ValueError: If ``values`` is not two-dimensional or a number is out of range.
     """
     if values.ndim != 2 or not values.shape[0]:
         raise ValueError(f"values have shape {values.shape}, expected [S >= 1, T]")
@@ -199,7 +199,7 @@ def ratio(
 
     Args:
         samples: Values [n].
-        baseline: Values [m], drawn independently of `samples`.
+        baseline: Values [m], drawn independently of ``samples``.
         statistic: Function of [..., n] along the last axis.
         resamples: Number of resamples.
         confidence: Probability mass of the interval, in (0, 1).

@@ -89,7 +89,7 @@ class Theme:
     faint: str
     """Grid and spines."""
     variants: tuple[str, ...]
-    """One colour per entry of `VARIANTS`."""
+    """One colour per entry of ``VARIANTS``."""
     sequence: tuple[float, float]
     """Part of the viridis map used for ordered values such as phi."""
 
@@ -141,7 +141,7 @@ def variant_mark(variant: str, theme: Theme) -> Mark:
 
 
 def ordered_mark(index: int, count: int, theme: Theme) -> Mark:
-    """Return the look of the `index`-th of `count` ordered values (dark to bright)."""
+    """Return the look of the ``index``-th of ``count`` ordered values (dark to bright)."""
     low, high = theme.sequence
     share = low + (high - low) * index / max(count - 1, 1)
     colour = to_hex(colormaps["viridis"](share))
@@ -165,7 +165,7 @@ def metric_label(name: str) -> str:
 
 
 def canonical(values: Iterable, order: tuple[str, ...] = ()) -> list:
-    """Sort values: those of `order` first, as listed there, then the rest by value."""
+    """Sort values: those of ``order`` first, as listed there, then the rest by value."""
     distinct = set(values)
     known = [value for value in order if value in distinct]
     return known + sorted(distinct - set(order))

@@ -42,7 +42,7 @@ class Summary:
     shift: str
     """Dynamics shift."""
     variant: str
-    """Variant name."""
+    """Variant name, or the run's where runs are summarised."""
     settings: dict[str, float]
     """phi and utd, where the table states them."""
     arms: tuple[str, ...]
@@ -66,7 +66,7 @@ class Summary:
     robust: Interval
     """IQM (mean for a rate) with its stratified bootstrap interval."""
     ratio: Interval | None
-    """`robust` over that of the baseline; None for the baseline itself or where there is none."""
+    """``robust`` over that of the baseline; None for the baseline itself or where there is none."""
     better: Interval | None
     """Probability of being better than the baseline; None as above."""
 
@@ -90,12 +90,12 @@ def baseline_of(grid: str) -> dict[str, object]:
 
 
 def grid_kind(grid: str) -> str:
-    """Return the kind of a grid from its name: `phi`, `phi_small` and `phi-cpu` are all `phi`."""
+    """Return the first word of a grid's name: ``phi``, ``phi_small`` and ``phi-cpu`` are alike."""
     return grid.replace("-", "_").split("_")[0]
 
 
 def main_metric(table: Table) -> str:
-    """Return the first of `MAIN_METRICS` that every run of a table reports.
+    """Return the first of ``MAIN_METRICS`` that every run of a table reports.
 
     Raises:
         TableError: If there is none; the message names a run without.
@@ -122,7 +122,11 @@ def shown_metrics(table: Table, main: str) -> list[str]:
 
 
 def summarise(
-    table: Table, metric: str, baseline: dict[str, object] | None = None
+    table: Table,
+    metric: str,
+    baseline: dict[str, object] | None = None,
+    *,
+    by: str = "variant",
 ) -> list[Summary]:
     """Return one summary per cell, in the order of figures.
 
@@ -130,7 +134,8 @@ def summarise(
         table: Curve or episode rows.
         metric: What to summarise.
         baseline: Column = value of the cells to compare with, for example
-            `{"variant": "scratch"}`; None or empty for no comparison.
+            ``{"variant": "scratch"}``; None or empty for no comparison.
+        by: What a cell stands for: ``variant``, or ``run`` to set runs side by side.
 
     Raises:
         TableError: If the rows lack the metric or contradict themselves.
@@ -143,7 +148,7 @@ def summarise(
     statistic = statistics_of(metric)[-1]
     summaries = []
     for (task, shift), part in groups(rows, ["task", "shift"]).items():
-        cells = groups(part, ["variant", *extra])
+        cells = groups(part, [by, *extra])
         end = ends[(task, shift)]
         strata = {key: cell_strata(cell, end) for key, cell in cells.items()}
         reference = _find_baseline(cells, baseline or {})
@@ -160,9 +165,9 @@ def summarise(
 
 
 def shift_wins(summaries: list[Summary]) -> tuple[int, int]:
-    """Return in how many (task, shift) cells a TWiRL variant beats `weights` and `zero-shot`.
+    """Return in how many (task, shift) cells a TWiRL variant beats ``weights`` and ``zero-shot``.
 
-    Only cells that hold a TWiRL variant and both others count; the measure is `robust`.
+    Only cells that hold a TWiRL variant and both others count; the measure is ``robust``.
 
     Args:
         summaries: Summaries of a metric of which more is better.

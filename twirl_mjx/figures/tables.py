@@ -1,12 +1,12 @@
 """Read tidy result tables and refuse what is wrong with them.
 
 Two kinds of table exist. A *curve* table has one row per metric and moment of training
-(`metrics.csv` of a run, `experiments/results/<grid>/<arm>.csv`); an *episode* table has one row
-per metric and evaluated episode (`eval.csv`). Both are plain CSV, so that every figure can be
+(``metrics.csv`` of a run, ``experiments/results/<grid>/<arm>.csv``); an *episode* table has one row
+per metric and evaluated episode (``eval.csv``). Both are plain CSV, so that every figure can be
 rebuilt by anyone, without an accelerator and without the code that made the numbers.
 
-A table may open with comment lines `# key: text`. Two keys mean something to the figures:
-`reduced` (the run was smaller than the paper's, and how) and `command` (the command that makes
+A table may open with comment lines ``# key: text``. Two keys mean something to the figures:
+``reduced`` (the run was smaller than the paper's, and how) and ``command`` (the command that makes
 the rows again).
 """
 
@@ -32,7 +32,7 @@ CURVE_COLUMNS = (
     "wall_s",
     "value",
 )
-"""Columns of a curve table; `wall_s` in seconds, the steps are counts."""
+"""Columns of a curve table; ``wall_s`` in seconds, the steps are counts."""
 
 EPISODE_COLUMNS = (
     "run",
@@ -45,7 +45,7 @@ EPISODE_COLUMNS = (
     "metric",
     "value",
 )
-"""Columns of an episode table; `env_steps` is the age of the evaluated policy."""
+"""Columns of an episode table; ``env_steps`` is the age of the evaluated policy."""
 
 OPTIONAL_COLUMNS = ("phi", "utd")
 """Columns that either kind may add: share of source rows in a minibatch, updates per transition."""
@@ -64,12 +64,12 @@ class TableError(ValueError):
 
 @dataclass(frozen=True)
 class Note:
-    """One comment line `# key: text` of a table."""
+    """One comment line ``# key: text`` of a table."""
 
     arm: str
     """File name of the table without its ending."""
     key: str
-    """What the note is about, for example `reduced` or `command`; empty for free text."""
+    """What the note is about, for example ``reduced`` or ``command``; empty for free text."""
     text: str
     """The note itself."""
 
@@ -111,13 +111,13 @@ def nearest(value: object, known: Iterable[object]) -> str:
 def read_table(path: str | Path) -> Table:
     """Read one CSV file of either kind and check every cell.
 
-    NaN in `value` means "not measured" and is kept; infinities are refused.
+    NaN in ``value`` means "not measured" and is kept; infinities are refused.
 
     Args:
         path: The CSV file.
 
     Returns:
-        The table, with the column `arm` added; it may have no rows.
+        The table, with the column ``arm`` added; it may have no rows.
 
     Raises:
         TableError: If the file is missing or empty, a column is missing, unknown or named twice,
@@ -150,7 +150,7 @@ def read_table(path: str | Path) -> Table:
 
 
 def read_curves(path: str | Path) -> Table:
-    """Read a curve table (`metrics.csv`); see `read_table`.
+    """Read a curve table (``metrics.csv``); see ``read_table``.
 
     Raises:
         TableError: If the file is not a valid curve table.
@@ -162,7 +162,7 @@ def read_curves(path: str | Path) -> Table:
 
 
 def read_episodes(path: str | Path) -> Table:
-    """Read an episode table (`eval.csv`); see `read_table`.
+    """Read an episode table (``eval.csv``); see ``read_table``.
 
     Raises:
         TableError: If the file is not a valid episode table.
@@ -174,10 +174,10 @@ def read_episodes(path: str | Path) -> Table:
 
 
 def read_directory(directory: str | Path) -> tuple[Table | None, Table | None]:
-    """Read every `*.csv` of a grid's directory.
+    """Read every ``*.csv`` of a grid's directory.
 
     Args:
-        directory: `experiments/results/<grid>`.
+        directory: ``experiments/results/<grid>``.
 
     Returns:
         The curve rows and the episode rows; None where there are none.
@@ -219,7 +219,7 @@ def concatenate(tables: Sequence[Table], *, source: str) -> Table:
 
 
 def mask(table: Table, rows: np.ndarray) -> Table:
-    """Return the rows where the boolean array `rows` [R] holds; the notes stay."""
+    """Return the rows where the boolean array ``rows`` [R] holds; the notes stay."""
     return Table({k: v[rows] for k, v in table.columns.items()}, table.notes, table.source)
 
 
@@ -231,7 +231,7 @@ def select(table: Table, **equals: object) -> Table:
         **equals: column=value.
 
     Raises:
-        TableError: If a column does not exist, or holds the value in no row of `table`.
+        TableError: If a column does not exist, or holds the value in no row of ``table``.
     """
     rows = np.ones(len(table), bool)
     for name, value in equals.items():
