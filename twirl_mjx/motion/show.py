@@ -1,0 +1,228 @@
+"""Figures and pictures of clips: what a motion does, next to others, and the robot doing it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import imageio.v3 as iio
+import jax
+import jax.numpy as jnp
+import matplotlib.figure
+import mujoco
+import numpy as np
+
+from twirl_mjx.motion.clip import Clip, headings, sample
+from twirl_mjx.motion.formats import foot_paths
+from twirl_mjx.sim import a1
+
+FOOT_COLORS = ("#D55E00", "#E69F00", "#0072B2", "#56B4E9")
+"""FR FL RR RL: warm colours in front, cold ones behind (Okabe and Ito's palette)."""
+NEAR_GROUND = 0.005
+"""m, a foot lower than this counts as standing in the figures."""
+
+
+def pitch_angles(clip: Clip) -> np.ndarray:
+    """Return the pitch [F] in degrees, nose up positive."""
+    w, x, y, z = clip.root_quat.T
+    return -np.degrees(np.arcsin(np.clip(2 * (w * y - z * x), -1.0, 1.0)))
+
+
+def forward_paths(clip: Clip) -> tuple[np.ndarray, np.ndarray]:
+    """Return root and foot positions [F, 3], [F, 4, 3] m, moved and turned to start along x."""
+    yaw = headings(clip.root_quat[:1])[0]
+    c, s = np.cos(-yaw), np.sin(-yaw)
+    turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    origin = clip.root_pos[0] * np.array([1.0, 1.0, 0.0])
+    return (clip.root_pos - origin) @ turn.T, (foot_paths(clip) - origin) @ turn.T
+
+
+def show(clip: Clip, path: str | Path) -> None:
+    """Draw root height, pitch, foot heights and contact phases over one cycle.
+
+    Args:
+        clip: The motion.
+        path: Image file to write; the ending decides the format.
+    """
+    times = np.arange(clip.num_frames) * clip.frame_duration
+    lowest = foot_paths(clip)[..., 2] - a1.FOOT_RADIUS
+    figure = matplotlib.figure.Figure(figsize=(7.0, 6.2), layout="constrained")
+    height, pitch, feet, phases = figure.subplots(
+        4, 1, sharex=True, gridspec_kw={"height_ratios": [2, 1.4, 2, 1.2]}
+    )
+    height.plot(times, clip.root_pos[:, 2], color="black")
+    height.set_ylabel("root height (m)")
+    pitch.plot(times, pitch_angles(clip), color="black")
+    pitch.axhline(0.0, color="0.8", lw=0.8, zorder=0)
+    pitch.set_ylabel("nose-up pitch (deg)")
+    for leg, (name, color) in enumerate(zip(a1.LEGS, FOOT_COLORS, strict=True)):
+        feet.plot(times, lowest[:, leg], color=color, label=name, ls="-" if leg % 2 else "--")
+        standing = lowest[:, leg] < NEAR_GROUND
+        phases.fill_between(
+            times, 3 - leg - 0.35, 3 - leg + 0.35, where=standing.tolist(), color=color, lw=0
+        )
+    feet.set_ylabel("foot height (m)")
+    feet.legend(ncols=4, frameon=False, loc="upper right")
+    flight = (lowest >= NEAR_GROUND).all(axis=1)
+    for axes in (height, pitch, feet, phases):
+        axes.fill_between(
+            times,
+            0,
+            1,
+            where=flight.tolist(),
+            transform=axes.get_xaxis_transform(),
+            color="0.93",
+            lw=0,
+            zorder=-1,
+        )
+        axes.spines[["top", "right"]].set_visible(False)
+    phases.set_yticks(range(4), a1.LEGS[::-1])
+    phases.set_ylabel("contact")
+    phases.set_xlabel("time (s), all feet airborne where shaded")
+    distance = float(np.linalg.norm(clip.cycle_displacement[:2]))
+    height.set_title(
+        f"{clip.name}: {distance:.2f} m in {clip.cycle_duration:.2f} s, "
+        f"{flight[:-1].sum() * clip.frame_duration:.2f} s airborne",
+        loc="left",
+    )
+    figure.savefig(path, dpi=150)
+
+
+def compare(clips: Sequence[Clip], path: str | Path, source: str = "") -> None:
+    """Draw several clips over the distance travelled: trunk height, pitch, feet.
+
+    Args:
+        clips: The motions; the first one is drawn in black, as ours.
+        path: Image file to write.
+        source: Where the other motions come from, written into the figure.
+    """
+    figure = matplotlib.figure.Figure(figsize=(7.0, 6.6), layout="constrained")
+    axes = figure.subplots(4, 1, gridspec_kw={"height_ratios": [1.6, 1.4, 1.4, 1.4]})
+    colors = ["black", *(color for color in ("#0072B2", "#56B4E9", "#009E73", "#CC79A7"))]
+    for index, clip in enumerate(clips):
+        root, feet = forward_paths(clip)
+        times = np.arange(clip.num_frames) * clip.frame_duration
+        lowest = feet[..., 2] - a1.FOOT_RADIUS
+        apex = np.argmax(lowest.min(axis=1))  # line the leaps up where they clear the most
+        style = {"color": colors[index % len(colors)], "lw": 1.8 if index == 0 else 1.1}
+        axes[0].plot(root[:, 0] - root[apex, 0], root[:, 2], label=clip.name, **style)
+        axes[1].plot(times - times[apex], pitch_angles(clip), **style)
+        axes[2].plot(times - times[apex], lowest[:, :2].min(axis=1), **style)
+        axes[3].plot(times - times[apex], lowest[:, 2:].min(axis=1), **style)
+    axes[0].set_xlabel("distance from the top of the leap (m)")
+    axes[0].set_ylabel("root height (m)")
+    axes[0].legend(frameon=False, fontsize=8, loc="upper right")
+    for axis, label in zip(
+        axes[1:], ("nose-up pitch (deg)", "front feet (m)", "hind feet (m)"), strict=True
+    ):
+        axis.set_ylabel(label)
+    axes[3].set_xlabel(
+        "time from the top of the leap (s)" + (f"; other clips: {source}" if source else "")
+    )
+    for axis in axes:
+        axis.spines[["top", "right"]].set_visible(False)
+    figure.savefig(path, dpi=150)
+
+
+def _scene(bands: Sequence[float]) -> mujoco.MjModel:
+    """Return the robot on a floor with drawn hurdle bands at x in m."""
+    spec = mujoco.MjSpec.from_file(str(a1.xml_path()))
+    spec.add_texture(
+        name="floor",
+        type=mujoco.mjtTexture.mjTEXTURE_2D,
+        width=256,
+        height=256,
+        builtin=mujoco.mjtBuiltin.mjBUILTIN_CHECKER,
+        rgb1=[0.82, 0.84, 0.86],
+        rgb2=[0.74, 0.77, 0.80],
+    )
+    material = spec.add_material(name="floor", texrepeat=[2, 2], texuniform=True)
+    material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "floor"
+    spec.add_texture(
+        name="sky",
+        type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
+        width=64,
+        height=64,
+        builtin=mujoco.mjtBuiltin.mjBUILTIN_FLAT,
+        rgb1=[0.95, 0.97, 1.0],
+        rgb2=[0.95, 0.97, 1.0],
+    )
+    world = spec.worldbody
+    world.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 0.05], material="floor")
+    world.add_light(
+        pos=[0, -1, 4],
+        dir=[0.2, 0.3, -1],
+        type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
+        diffuse=[0.7, 0.7, 0.7],
+    )
+    for x in bands:
+        world.add_geom(
+            type=mujoco.mjtGeom.mjGEOM_BOX,
+            size=[0.1, 0.8, 0.005],
+            pos=[x, 0, 0.005],
+            rgba=[0.90, 0.33, 0.12, 1],
+        )
+    spec.visual.headlight.ambient = [0.4, 0.4, 0.4]
+    spec.visual.global_.offwidth, spec.visual.global_.offheight = 1280, 960
+    return spec.compile()
+
+
+def render(
+    clip: Clip,
+    times: np.ndarray,
+    *,
+    size: tuple[int, int] = (480, 320),
+    bands: Sequence[float] = (),
+) -> np.ndarray:
+    """Render the A1 in the poses of a clip, seen from its right side.
+
+    Needs an OpenGL context: without a display set ``MUJOCO_GL`` to ``egl`` or ``osmesa``.
+
+    Args:
+        clip: The motion.
+        times: [T] s, any sign for a wrapping clip.
+        size: Width and height in pixels.
+        bands: x in m of hurdle bands to draw.
+
+    Returns:
+        [T, height, width, 3] uint8.
+    """
+    model = _scene(bands)
+    data = mujoco.MjData(model)
+    camera = mujoco.MjvCamera()
+    camera.azimuth, camera.elevation, camera.distance = 80.0, -10.0, 1.25
+    images = []
+    with mujoco.Renderer(model, size[1], size[0]) as renderer:
+        for qpos in poses(clip, times):
+            data.qpos[:] = qpos
+            mujoco.mj_kinematics(model, data)
+            mujoco.mj_comPos(model, data)
+            camera.lookat[:] = qpos[0], qpos[1], 0.28
+            renderer.update_scene(data, camera)
+            images.append(renderer.render())
+    return np.array(images)
+
+
+def poses(clip: Clip, times: np.ndarray) -> np.ndarray:
+    """Return the clip's configurations [T, 19] at ``times`` [T] s, one cycle after another."""
+    qpos, _ = jax.vmap(sample, in_axes=(None, 0))(clip.to_arrays(), jnp.asarray(times, jnp.float32))
+    return np.asarray(qpos)
+
+
+def render_strip(
+    clip: Clip, path: str | Path, *, count: int = 10, columns: int = 5, bands: Sequence[float] = ()
+) -> None:
+    """Write a PNG of ``count`` poses of one cycle, in rows of ``columns``."""
+    times = np.arange(count) * clip.cycle_duration / count
+    images = render(clip, times, size=(360, 260), bands=bands)
+    blank = np.full_like(images[:1], 255).repeat(-count % columns, axis=0)
+    rows = np.concatenate([images, blank]).reshape(-1, columns, *images.shape[1:])
+    iio.imwrite(path, np.concatenate([np.concatenate(list(row), axis=1) for row in rows]))
+
+
+def render_video(
+    clip: Clip, path: str | Path, *, cycles: int = 3, fps: int = 40, bands: Sequence[float] = ()
+) -> None:
+    """Write an MP4 of some cycles."""
+    times = np.arange(int(cycles * clip.cycle_duration * fps)) / fps
+    iio.imwrite(path, render(clip, times, size=(640, 400), bands=bands), fps=fps)
