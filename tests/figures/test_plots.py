@@ -141,8 +141,19 @@ def test_untrained_variants_are_level_lines(tmp_path, write, rows_of):
 def test_reduced_results_say_so_in_the_picture(icy):
     for figure in (plots.learning_curves(icy, "return"), plots.shift_bars(icy, "return")):
         assert "Reduced: 2 seeds" in texts(figure)
+        assert any(", 2 seeds" in text for text in texts(figure))
     whole = tables.Table(icy.columns, (), icy.source)
     assert not any("educed" in text for text in texts(plots.learning_curves(whole, "return")))
+
+
+def test_a_single_seed_is_shown_without_an_interval(icy):
+    single = tables.select(icy, seed=0)
+    figure = plots.shift_bars(single, "return")
+    assert any("one seed allows no interval" in text for text in texts(figure))
+    assert list(figure.axes[0].collections) == []
+    curves = plots.learning_curves(single, "return")
+    assert "Lines: single runs; one seed allows no interval." in texts(curves)
+    assert list(curves.axes[0].collections) == []
 
 
 def test_ablation_has_one_line_and_one_point_per_value(tmp_path, write, rows_of):

@@ -163,6 +163,19 @@ def curve(series: Sequence[Series], statistic: str) -> Curve:
     return Curve(axis, centre, centre - spread, centre + spread)
 
 
+def seed_counts(table: Table, by: str) -> tuple[int, str]:
+    """Return the most runs in a cell, and the range of runs per cell in words.
+
+    Args:
+        table: Any rows.
+        by: What a cell stands for, besides task and shift.
+    """
+    cells = groups(table, ["task", "shift", by]).values()
+    counts = [len(groups(cell, ["arm", "run", "seed"])) for cell in cells]
+    low, high = min(counts), max(counts)
+    return high, f"{low} to {high} seeds" if low < high else f"{high} seed{'s' * (high > 1)}"
+
+
 def common_end(table: Table) -> dict[tuple, int]:
     """Return, per (task, shift), the transitions that every trained run reached.
 

@@ -18,9 +18,10 @@ from twirl_mjx.figures.aggregate import (
     estimate,
     groups,
     metric_rows,
+    seed_counts,
 )
 from twirl_mjx.figures.canvas import Canvas, canvas, steps_axis
-from twirl_mjx.figures.curves import BANDS, draw_curves, line_marks
+from twirl_mjx.figures.curves import MEANINGS, curves_caption, draw_curves, line_marks
 from twirl_mjx.figures.statistics import Interval
 from twirl_mjx.figures.style import (
     SHIFTS,
@@ -38,11 +39,6 @@ from twirl_mjx.figures.style import (
 )
 from twirl_mjx.figures.tables import Table, nearest, select, unique
 
-_WHISKERS = {
-    "mean": "Bars: mean, whiskers: standard deviation",
-    "rate": "Bars: mean, whiskers: 95 % bootstrap interval",
-    "iqm": "Bars: interquartile mean, whiskers: 95 % bootstrap interval",
-}
 _ABLATIONS = ("phi", "utd")
 _BARS_BY = ("variant", "run")
 _AXIS_NAMES = {
@@ -125,7 +121,7 @@ def shift_bars(
             axes.set_xticks(range(len(shifts)), shifts)
             axes.set_xlim(-0.5, len(shifts) - 0.5)
             axes.tick_params(axis="x", length=0)
-        frame.captions.append(_bars_caption(rows, statistic, ends))
+        frame.captions.append(_bars_caption(rows, statistic, by, ends))
     return frame.figure
 
 
@@ -167,7 +163,9 @@ def ablation(
             right.set_title(f"after {short_count(ends[key])} transitions")
             _draw_points(frame, right, part, column, statistic, ends[key])
             right.set_xlabel(_AXIS_NAMES[column])
-        frame.captions.append(f"{BANDS[statistic]} Points and whiskers on the right: the same.")
+        frame.captions.append(
+            f"{curves_caption(rows, statistic, column)} Right: the same as point, whisker and dots."
+        )
     return frame.figure
 
 
@@ -232,11 +230,16 @@ def _draw_dots(axes: Axes, x: float, values: np.ndarray, spread: float, theme: T
     )
 
 
-def _bars_caption(table: Table, statistic: str, ends: Mapping[tuple, int]) -> str:
+def _bars_caption(table: Table, statistic: str, by: str, ends: Mapping[tuple, int]) -> str:
+    """Return what bars and whiskers are, of how many runs, and after how many transitions."""
+    most, seeds = seed_counts(table, by)
+    centre, bounds = MEANINGS[statistic]
     if table.is_episodes:
-        runs = len(groups(table, ["arm", "run", "seed"]))
-        many = "s" * (runs != 1)
-        return f"{_WHISKERS[statistic]}, over the episodes of {runs} run{many}; dots: single runs."
-    reached = sorted({short_count(end) for end in ends.values() if end}, key=len)
-    after = f" after {' to '.join([reached[0], reached[-1]][: len(reached)])} transitions"
-    return f"{_WHISKERS[statistic]}{after if reached else ''}; dots: single runs."
+        runs = "one run per bar." if most == 1 else f"{seeds} per bar; dots: single runs."
+        return f"Bars: {centre}, whiskers: {bounds}, over the episodes of {runs}"
+    reached = sorted({end for end in ends.values() if end})
+    limits = " to ".join(dict.fromkeys(short_count(end) for end in (*reached[:1], *reached[-1:])))
+    after = f" after {limits} transitions" if reached else ""
+    if most == 1:
+        return f"Bars: single runs{after}; one seed allows no interval."
+    return f"Bars: {centre}, whiskers: {bounds}, {seeds}{after}; dots: single runs."

@@ -17,6 +17,7 @@ from twirl_mjx.figures.aggregate import (
     groups,
     metric_rows,
     run_series,
+    seed_counts,
 )
 from twirl_mjx.figures.canvas import Canvas, canvas, steps_axis
 from twirl_mjx.figures.style import (
@@ -35,12 +36,12 @@ from twirl_mjx.figures.tables import Table, TableError, nearest, unique
 BY = ("variant", "phi", "utd")
 """What the lines of a panel may stand for."""
 
-BANDS = {
-    "mean": "Line and band: mean ± standard deviation over seeds; thin: single runs.",
-    "rate": "Line and band: mean and 95 % bootstrap interval; thin: single runs.",
-    "iqm": "Line and band: interquartile mean and 95 % bootstrap interval; thin: single runs.",
+MEANINGS = {
+    "mean": ("mean", "standard deviation"),
+    "rate": ("mean", "95 % bootstrap interval"),
+    "iqm": ("interquartile mean", "95 % bootstrap interval"),
 }
-"""Caption per statistic."""
+"""Statistic -> what the centre and the bounds are, for captions."""
 
 
 def learning_curves(
@@ -88,7 +89,7 @@ def learning_curves(
             steps_axis(axes, ticks=5 if shape[1] < 3 else 3, label=row == max(r for r, _ in below))
             if column == 0:
                 axes.set_ylabel(metric_label(metric))
-        frame.captions.append(BANDS[statistic])
+        frame.captions.append(curves_caption(rows, statistic, by))
     return frame.figure
 
 
@@ -119,6 +120,15 @@ def draw_curves(frame: Canvas, axes: Axes, table: Table, *, statistic: str, by: 
     axes.set_xlim(0, max(end, 1))
 
 
+def curves_caption(table: Table, statistic: str, by: str) -> str:
+    """Return what lines and bands are, and of how many seeds."""
+    most, seeds = seed_counts(table, by)
+    if most == 1:
+        return "Lines: single runs; one seed allows no interval."
+    centre, bounds = MEANINGS[statistic]
+    return f"Line: {centre}, band: {bounds}, {seeds}; thin: single runs."
+
+
 def line_marks(table: Table, by: str, theme: Theme) -> dict:
     """Return the look of every value of a column: fixed for variants, ordered for phi and utd.
 
@@ -137,13 +147,13 @@ def line_marks(table: Table, by: str, theme: Theme) -> dict:
 
 
 def _arrange(keys: Sequence[tuple]) -> tuple[tuple[int, int], dict[tuple, tuple[int, int]]]:
-    """Place panels: a row per task and a column per shift, or up to three tasks in a row."""
+    """Place panels: a row per task and a column per shift, or two or three tasks in a row."""
     tasks = canonical((task for task, _ in keys), TASKS)
     shifts = canonical((shift for _, shift in keys), SHIFTS)
     if len(shifts) > 1:
         places = {(t, s): (tasks.index(t), shifts.index(s)) for t, s in keys}
         return (len(tasks), len(shifts)), places
-    columns = min(3, len(tasks))
+    columns = min(2 if len(tasks) == 4 else 3, len(tasks))
     places = {(t, s): divmod(tasks.index(t), columns) for t, s in keys}
     return (-(-len(tasks) // columns), columns), places
 
