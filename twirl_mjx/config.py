@@ -1,21 +1,19 @@
-"""Configuration: frozen dataclasses, presets by name, JSON in and out.
+"""Configuration as frozen dataclasses, checked when built, long before anything is compiled.
 
-Defaults are the paper's numbers (spec sections 2 to 5); ``make_config`` applies a preset. Values
-are checked when a config is built, long before anything is compiled.
+Defaults are the paper's numbers; ``presets.make_config`` applies a preset and ``config_json``
+reads and writes configs.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import difflib
-import json
-from typing import Any, Literal
+from typing import Literal
 
 Variant = Literal["scratch", "twirl", "twirl+weights", "weights", "zero-shot"]
 VARIANTS: tuple[Variant, ...] = ("scratch", "twirl", "twirl+weights", "weights", "zero-shot")
 TASKS = ("stand", "biped", "imitate", "hurdles")
 SHIFTS = ("none", "bumpy", "icy", "weakened", "sloped", "gravity")
-PRESETS = ("paper", "cpu", "debug")
 SOURCE_OF = {"biped": "stand", "hurdles": "imitate"}
 """Task whose trained policy is the default source of another task."""
 
@@ -339,111 +337,3 @@ def check_updates(droq: DroqConfig, num_envs: int) -> None:
             f" vector step, which is not a whole number of blocks of droq.updates_per_block"
             f" {block} (nearest: utd {blocks * block / num_envs:g})"
         )
-
-
-def _paper(task: str) -> TrainConfig:
-    sourced = task in SOURCE_OF
-    return TrainConfig(
-        task=task,
-        variant="twirl" if sourced else "scratch",
-        stand=StandConfig(height_of="front_feet", risen_fraction=0.0),
-    )
-
-
-def _cpu(task: str) -> TrainConfig:
-    base = _paper(task)
-    return dataclasses.replace(
-        base,
-        total_env_steps=2_000_000,
-        warmup_env_steps=6400,
-        epoch_env_steps=6400,
-        env=EnvConfig(num_envs=64),
-        droq=DroqConfig(utd=1.0, updates_per_block=8),
-        eval=EvalConfig(every=64_000, episodes=32),
-        stand=StandConfig(height_of="front_feet", risen_fraction=0.25),
-    )
-
-
-def _debug(task: str) -> TrainConfig:
-    base = _paper(task)
-    return dataclasses.replace(
-        base,
-        total_env_steps=96,
-        warmup_env_steps=32,
-        epoch_env_steps=32,
-        env=EnvConfig(num_envs=4, episode_length=20),
-        droq=DroqConfig(utd=1.0, updates_per_block=4, batch_size=16, hidden_sizes=(32, 32)),
-        replay=ReplayConfig(capacity=1000, source_size=64),
-        eval=EvalConfig(every=64, episodes=2, final_episodes=4),
-        checkpoint_minutes=0.0,
-    )
-
-
-def make_config(task: str, preset: str = "paper") -> TrainConfig:
-    """Return the config of a task under a preset.
-
-    Args:
-        task: One of ``TASKS``.
-        preset: ``paper`` (the paper's numbers), ``cpu`` (the same method, settings for two CPU
-            cores) or ``debug`` (seconds, for tests).
-
-    Raises:
-        ValueError: Unknown task or preset, with the nearest valid name.
-    """
-    check_choice("task", task, TASKS)
-    check_choice("preset", preset, PRESETS)
-    return {"paper": _paper, "cpu": _cpu, "debug": _debug}[preset](task)
-
-
-def to_json(config: TrainConfig) -> str:
-    """Return the config as indented JSON with every field."""
-    return json.dumps(dataclasses.asdict(config), indent=2, sort_keys=True) + "\n"
-
-
-def from_dict(kind: type, values: dict[str, Any], where: str = "config") -> Any:
-    """Build a config dataclass from plain values (as JSON gives them).
-
-    Raises:
-        ValueError: An unknown key, with the nearest valid one, or a value out of range.
-    """
-    fields = {f.name: f for f in dataclasses.fields(kind)}
-    for key in values:
-        check_choice(f"key in {where}", key, tuple(fields))
-    made = {}
-    for key, value in values.items():
-        default = fields[key].default
-        if dataclasses.is_dataclass(default) and isinstance(value, dict):
-            value = from_dict(type(default), value, f"{where}.{key}")
-        elif isinstance(value, list):
-            value = tuple(value)
-        made[key] = value
-    return kind(**made)
-
-
-def from_json(text: str) -> TrainConfig:
-    """Read a config written by :func:`to_json`.
-
-    Raises:
-        ValueError: The text is not JSON, or holds an unknown key or a bad value.
-    """
-    return from_dict(TrainConfig, json.loads(text))
-
-
-def diff(a: TrainConfig, b: TrainConfig) -> list[str]:
-    """Return one line ``key: a -> b`` for every field in which two configs differ."""
-    flat_a, flat_b = flatten(a), flatten(b)
-    return [f"{k}: {flat_a[k]!r} -> {flat_b[k]!r}" for k in flat_a if flat_a[k] != flat_b[k]]
-
-
-def flatten(config: TrainConfig) -> dict[str, Any]:
-    """Return the config as a flat dict with dotted keys."""
-
-    def walk(value: Any, prefix: str) -> dict[str, Any]:
-        if not dataclasses.is_dataclass(value):
-            return {prefix[:-1]: value}
-        out: dict[str, Any] = {}
-        for field in dataclasses.fields(value):
-            out |= walk(getattr(value, field.name), f"{prefix}{field.name}.")
-        return out
-
-    return walk(config, "")

@@ -151,15 +151,24 @@ def from_transitions(batch: Transition) -> RingBuffer:
     Raises:
         ValueError: If the batch is empty.
     """
-    rows = pack(batch)
-    if rows.ndim != 2 or rows.shape[0] < 1:
-        raise ValueError(f"a ring needs transitions of shape [C >= 1, ...]; got rows {rows.shape}")
+    return from_rows(pack(batch), batch.obs.shape[-1], batch.action.shape[-1])
+
+
+def from_rows(rows: jax.Array, obs_size: int, action_size: int) -> RingBuffer:
+    """Make a full buffer of packed transitions [C, 2O + A + 2].
+
+    Raises:
+        ValueError: If there is no row, or the rows are not as long as the sizes say.
+    """
+    width = row_size(obs_size, action_size)
+    if rows.ndim != 2 or rows.shape[0] < 1 or rows.shape[1] != width:
+        raise ValueError(f"a ring needs rows of shape [C >= 1, {width}]; got {rows.shape}")
     return RingBuffer(
-        rows=rows,
+        rows=jnp.asarray(rows, jnp.float32),
         insert_index=jnp.zeros((), jnp.int32),
         size=jnp.full((), rows.shape[0], jnp.int32),
-        obs_size=batch.obs.shape[-1],
-        action_size=batch.action.shape[-1],
+        obs_size=obs_size,
+        action_size=action_size,
     )
 
 

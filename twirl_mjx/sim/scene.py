@@ -28,6 +28,10 @@ BUMP_CELL = 0.3
 """m, edge of a heightfield tile (spec section 6)."""
 BUMP_HALF_SIZE = 30.0
 """m, half the edge of the square heightfield patch."""
+BUMP_HEIGHT = 0.05
+"""m, highest point of the heightfield at strength 1 (spec section 6)."""
+MAX_BUMP_HEIGHT = 0.1
+"""m, highest point at strength 2, which contact detection has to allow for."""
 BUMP_SEED = 7
 """Seed of the heightfield: every world walks on the same terrain, from another place."""
 
@@ -107,7 +111,7 @@ def _add_ground(spec: mujoco.MjSpec, kind: SceneKind) -> tuple[str, ...]:
             name="bumps",
             nrow=bumps.shape[0],
             ncol=bumps.shape[1],
-            size=[BUMP_HALF_SIZE, BUMP_HALF_SIZE, 0.05, 0.1],
+            size=[BUMP_HALF_SIZE, BUMP_HALF_SIZE, MAX_BUMP_HEIGHT, 0.1],
             userdata=bumps.ravel(),
         )
         world.add_geom(
@@ -232,12 +236,15 @@ def build_scene(
     spec.option.iterations = options.iterations
     spec.option.ls_iterations = options.ls_iterations
     model = spec.compile()
+    bumps = unit_bumps() if kind == "bumpy" else np.zeros((1, 1), np.float32)
+    if kind == "bumpy":  # the compiler has scaled them to the full height
+        model.hfield_data[:] = bumps.ravel() * (BUMP_HEIGHT / MAX_BUMP_HEIGHT)
     return Scene(
         kind=kind,
         options=options,
         mj_model=model,
         ground_geoms=tuple(model.geom(name).id for name in ground),
-        bumps=unit_bumps() if kind == "bumpy" else np.zeros((1, 1), np.float32),
+        bumps=bumps,
     )
 
 
@@ -246,8 +253,8 @@ def terrain_height(
 ) -> jax.Array:
     """Return the height [...] in m of the ground under world positions ``xy`` [..., 2].
 
-    MuJoCo splits each heightfield cell along the diagonal from (column 0, row 1) to (column 1,
-    row 0); the two triangles are interpolated the same way here.
+    MuJoCo splits each heightfield cell along the diagonal from (column 0, row 0) to (column 1,
+    row 1); the two triangles are interpolated the same way here.
     """
     if scene.kind == "flat":
         return jnp.zeros(xy.shape[:-1], xy.dtype)
@@ -260,6 +267,6 @@ def terrain_height(
     col, row = jnp.moveaxis(cell.astype(jnp.int32), -1, 0)
     h00, h10 = bumps[row, col], bumps[row, col + 1]
     h01, h11 = bumps[row + 1, col], bumps[row + 1, col + 1]
-    lower = h00 + fx * (h10 - h00) + fy * (h01 - h00)
-    upper = h11 + (1 - fx) * (h01 - h11) + (1 - fy) * (h10 - h11)
-    return bump_height * jnp.where(fx + fy <= 1.0, lower, upper)
+    right = h00 + fx * (h10 - h00) + fy * (h11 - h10)
+    left = h00 + fy * (h01 - h00) + fx * (h11 - h01)
+    return bump_height * jnp.where(fx >= fy, right, left)

@@ -6,18 +6,22 @@ import dataclasses
 from collections.abc import Callable
 
 from twirl_mjx.config import TASKS as TASK_NAMES
-from twirl_mjx.config import TrainConfig, check_choice, make_config
+from twirl_mjx.config import TrainConfig, check_choice
 from twirl_mjx.sim.dynamics import SceneKind, get_shift, make_dynamics
 from twirl_mjx.sim.engine import make_engine
 from twirl_mjx.sim.scene import SimOptions, build_scene
 from twirl_mjx.tasks.base import Task
 from twirl_mjx.tasks.biped import Biped
+from twirl_mjx.tasks.hurdles import Hurdles
+from twirl_mjx.tasks.imitate import Imitate
 from twirl_mjx.tasks.stand import Stand
 from twirl_mjx.tasks.vector import VectorEnv
 
 TASKS: dict[str, Callable[[TrainConfig], Task]] = {
     "stand": Stand,
     "biped": Biped,
+    "imitate": Imitate,
+    "hurdles": Hurdles,
 }
 
 

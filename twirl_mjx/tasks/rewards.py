@@ -58,3 +58,28 @@ def joint_calm(joint_vel: jax.Array) -> jax.Array:
 def kernel(weighted_square_error: jax.Array) -> jax.Array:
     """Return exp(-e) of a weighted squared error (paper Table 2; Peng et al. 2020)."""
     return jnp.exp(-weighted_square_error)
+
+
+def joint_tracking(error: jax.Array) -> jax.Array:
+    """Return exp(-5 sum dq^2) of joint errors [12] in rad."""
+    return kernel(5.0 * jnp.sum(error**2))
+
+
+def joint_vel_tracking(error: jax.Array) -> jax.Array:
+    """Return exp(-0.1 sum dqdot^2) of joint velocity errors [12] in rad/s."""
+    return kernel(0.1 * jnp.sum(error**2))
+
+
+def root_tracking(error: jax.Array, angle: jax.Array) -> jax.Array:
+    """Return exp(-20 |dx|^2 - 10 theta^2), dx [3] in m and theta the rotation error in rad."""
+    return kernel(20.0 * jnp.sum(error**2) + 10.0 * angle**2)
+
+
+def root_vel_tracking(linear: jax.Array, angular: jax.Array) -> jax.Array:
+    """Return exp(-2 |dv|^2 - 0.2 |dw|^2) of errors [3] in m/s and [3] in rad/s, world frame."""
+    return kernel(2.0 * jnp.sum(linear**2) + 0.2 * jnp.sum(angular**2))
+
+
+def foot_tracking(error: jax.Array) -> jax.Array:
+    """Return exp(-40 sum_e |dx_e|^2) of errors [4, 3] in m of the feet relative to the root."""
+    return kernel(40.0 * jnp.sum(error**2))

@@ -9,8 +9,6 @@ dataset.
 
 from __future__ import annotations
 
-import json
-import shutil
 from pathlib import Path
 from typing import Any
 
@@ -30,13 +28,14 @@ def _is_key(leaf: Any) -> bool:
 
 
 def _flatten(tree: Any) -> dict[str, np.ndarray]:
-    """Return the leaves of a pytree by path, PRNG keys as their raw words."""
+    """Return the leaves of a pytree by path, PRNG keys as their raw words, none without size."""
     leaves = jax.tree_util.tree_flatten_with_path(tree)[0]
     return {
         jax.tree_util.keystr(path, simple=True, separator="."): np.asarray(
             jax.random.key_data(leaf) if _is_key(leaf) else leaf
         )
         for path, leaf in leaves
+        if leaf.size
     }
 
 
@@ -46,6 +45,9 @@ def _unflatten(template: Any, values: dict[str, np.ndarray]) -> Any:
     leaves = []
     for path, leaf in paths:
         name = jax.tree_util.keystr(path, simple=True, separator=".")
+        if not leaf.size:
+            leaves.append(jnp.zeros(leaf.shape, leaf.dtype))
+            continue
         if name not in values:
             raise ValueError(f"the checkpoint has no {name}: it is of another version or task")
         value = values[name]
@@ -198,15 +200,52 @@ def _bare(state: TrainState) -> Any:
     return state.replay.online.replace(rows=jnp.zeros((0, 0), jnp.float32))
 
 
-def read_progress(run_dir: Path) -> dict[str, Any]:
-    """Return ``progress`` of the newest checkpoint of a run, {} without one."""
-    paths = sorted((run_dir / "checkpoints" / "orbax").glob("[0-9]*"), key=lambda p: int(p.name))
+def _open(run_dir: Path) -> tuple[ocp.CheckpointManager, int]:
+    root = (run_dir / "checkpoints" / "orbax").resolve()
+    manager = ocp.CheckpointManager(
+        root, item_names=("policy", "train_state", "progress")
+    ) if root.is_dir() else None
+    step = manager.latest_step() if manager is not None else None
+    if manager is None or step is None:
+        raise FileNotFoundError(f"{run_dir} has no checkpoint: its train state is needed here")
+    return manager, step
+
+
+def load_learner(run_dir: Path) -> dict[str, Any]:
+    """Return actor, critic, target_critic and log_temperature of a run's newest checkpoint.
+
+    Raises:
+        FileNotFoundError: The run has no checkpoint.
+    """
+    manager, step = _open(run_dir)
+    flat = manager.restore(
+        step, args=ocp.args.Composite(train_state=ocp.args.StandardRestore())
+    )["train_state"]
+    manager.close()
+    nested: dict[str, Any] = {}
+    for name, value in flat.items():
+        parts = name.split(".")
+        if parts[0] != "learner":
+            continue
+        node = nested
+        for part in parts[1:-1]:
+            node = node.setdefault(part, {})
+        node[parts[-1]] = jnp.asarray(value)
+    return {k: nested[k] for k in ("actor", "critic", "target_critic", "log_temperature")}
+
+
+def load_replay(run_dir: Path) -> np.ndarray:
+    """Return the packed rows [n, W] of the online ring at a run's newest checkpoint, in order.
+
+    Raises:
+        FileNotFoundError: The run has no checkpoint or no stored experience.
+    """
+    manager, step = _open(run_dir)
+    found = manager.restore(step, args=ocp.args.Composite(progress=ocp.args.JsonRestore()))
+    manager.close()
+    total = int(found["progress"]["inserted"])
+    paths = sorted((run_dir / "checkpoints" / "replay").glob("rows_*.npy"))
     if not paths:
-        return {}
-    text = (paths[-1] / "progress" / "metadata").read_text()
-    return json.loads(text)
-
-
-def remove(run_dir: Path) -> None:
-    """Delete the checkpoints of a finished run; policies and tables stay."""
-    shutil.rmtree(run_dir / "checkpoints", ignore_errors=True)
+        raise FileNotFoundError(f"{run_dir} has no stored experience")
+    first = int(paths[0].stem.split("_")[1])
+    return np.concatenate([np.load(path) for path in paths])[: total - first]

@@ -10,7 +10,7 @@ import platform
 import subprocess
 from pathlib import Path
 
-from twirl_mjx import config as config_lib
+from twirl_mjx import config_json
 from twirl_mjx.config import TrainConfig
 
 CONFIG_NAME = "config.json"
@@ -35,7 +35,7 @@ def default_name(config: TrainConfig, preset: str) -> str:
 
 def digest(config: TrainConfig) -> str:
     """Return a short hash that identifies a resolved config."""
-    return hashlib.sha256(config_lib.to_json(config).encode()).hexdigest()[:12]
+    return hashlib.sha256(config_json.to_json(config).encode()).hexdigest()[:12]
 
 
 def open_run(run_dir: Path, config: TrainConfig) -> None:
@@ -46,10 +46,10 @@ def open_run(run_dir: Path, config: TrainConfig) -> None:
     """
     path = run_dir / CONFIG_NAME
     if path.exists():
-        old = config_lib.from_json(path.read_text())
+        old = config_json.from_json(path.read_text())
         lines = [
             line
-            for line in config_lib.diff(old, config)
+            for line in config_json.diff(old, config)
             if not line.startswith(tuple(MAY_CHANGE))
         ]
         if lines:
@@ -59,7 +59,7 @@ def open_run(run_dir: Path, config: TrainConfig) -> None:
                 f"\n  {shown}\nGive the same settings to resume it, or another --name."
             )
     run_dir.mkdir(parents=True, exist_ok=True)
-    _write(path, config_lib.to_json(config))
+    _write(path, config_json.to_json(config))
     _write(run_dir / VERSIONS_NAME, json.dumps(versions(), indent=2, sort_keys=True) + "\n")
 
 
@@ -77,7 +77,7 @@ def read_config(run_dir: Path) -> TrainConfig:
             f"{run_dir} is not a run: it has no {CONFIG_NAME}; runs in {parent}:"
             f" {', '.join(runs) or 'none'}"
         )
-    return config_lib.from_json(path.read_text())
+    return config_json.from_json(path.read_text())
 
 
 def versions() -> dict[str, str]:

@@ -1,0 +1,14 @@
+"""``twirl train``."""
+
+from __future__ import annotations
+
+from twirl_mjx.commands.options import parse_train, say
+from twirl_mjx.training import pipeline
+
+
+def main(argv: list[str]) -> int:
+    """Train to the budget; see ``training.pipeline``."""
+    options = parse_train(argv)
+    run_dir = pipeline.run(options.config, options.preset, options.runs, options.name, say)
+    say(f"done: {run_dir} (policy.npz, metrics.csv, eval.csv); film it: twirl render {run_dir}")
+    return 0

@@ -1,0 +1,63 @@
+"""Configs as JSON, and the difference between two of them."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from typing import Any
+
+from twirl_mjx.config import TrainConfig, check_choice
+
+
+def to_json(config: TrainConfig) -> str:
+    """Return the config as indented JSON with every field."""
+    return json.dumps(dataclasses.asdict(config), indent=2, sort_keys=True) + "\n"
+
+
+def from_dict(kind: type, values: dict[str, Any], where: str = "config") -> Any:
+    """Build a config dataclass from plain values (as JSON gives them).
+
+    Raises:
+        ValueError: An unknown key, with the nearest valid one, or a value out of range.
+    """
+    fields = {f.name: f for f in dataclasses.fields(kind)}
+    for key in values:
+        check_choice(f"key in {where}", key, tuple(fields))
+    made = {}
+    for key, value in values.items():
+        default = fields[key].default
+        if dataclasses.is_dataclass(default) and isinstance(value, dict):
+            value = from_dict(type(default), value, f"{where}.{key}")
+        elif isinstance(value, list):
+            value = tuple(value)
+        made[key] = value
+    return kind(**made)
+
+
+def from_json(text: str) -> TrainConfig:
+    """Read a config written by :func:`to_json`.
+
+    Raises:
+        ValueError: The text is not JSON, or holds an unknown key or a bad value.
+    """
+    return from_dict(TrainConfig, json.loads(text))
+
+
+def diff(a: TrainConfig, b: TrainConfig) -> list[str]:
+    """Return one line ``key: a -> b`` for every field in which two configs differ."""
+    flat_a, flat_b = flatten(a), flatten(b)
+    return [f"{k}: {flat_a[k]!r} -> {flat_b[k]!r}" for k in flat_a if flat_a[k] != flat_b[k]]
+
+
+def flatten(config: TrainConfig) -> dict[str, Any]:
+    """Return the config as a flat dict with dotted keys."""
+
+    def walk(value: Any, prefix: str) -> dict[str, Any]:
+        if not dataclasses.is_dataclass(value):
+            return {prefix[:-1]: value}
+        out: dict[str, Any] = {}
+        for field in dataclasses.fields(value):
+            out |= walk(getattr(value, field.name), f"{prefix}{field.name}.")
+        return out
+
+    return walk(config, "")

@@ -1,0 +1,188 @@
+"""Task ``hurdles``: jump over randomly spaced hurdles (paper, "Jumping Task").
+
+Observation [95]: ``observations.PROPRIOCEPTIVE``. Action [12] in [-1, 1]. Goal: centre of the next
+hurdle; a hurdle is passed when the root is 0.4 m beyond it. Reward: the four terms of ``WEIGHTS``.
+Terminates when any part of the robot touches a hurdle at any physics substep, or the trunk touches
+the ground.
+"""
+
+from __future__ import annotations
+
+import math
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from twirl_mjx.config import TrainConfig
+from twirl_mjx.sim import a1, frames, kinematics
+from twirl_mjx.sim.dynamics import Dynamics
+from twirl_mjx.sim.scene import BUMP_HALF_SIZE, CONTROL_DT, CollisionSet, Scene
+from twirl_mjx.tasks import bands, base, rewards
+from twirl_mjx.tasks.observations import ProprioceptiveObserver
+
+WEIGHTS = {"forward": 0.7, "orientation": 0.05, "joint_calm": 0.15, "hurdle": 0.1}
+"""Weights of the reward terms (paper appendix, table of the jumping task)."""
+
+PASSED = 0.4
+"""m, a hurdle counts as passed when the root is this far beyond its centre (paper)."""
+MAX_SPEED = 4.0
+"""m/s, there are hurdles enough for an episode at this speed (the A1's best is 3.3 m/s)."""
+BUMPY_START_X = (-BUMP_HALF_SIZE + 1.0, -BUMP_HALF_SIZE + 11.0)
+"""m, on bumpy ground episodes start in this range of x, near one edge, to run across the terrain."""
+FOOT_CONTACT = 0.001
+"""m, a foot below this clearance is on the ground: contacts on a slope, measured straight down,
+begin above 0."""
+
+
+@flax.struct.dataclass
+class HurdlesState:
+    """State of the task in one world."""
+
+    start: jax.Array
+    """[2] m, where the episode began, world frame."""
+    positions: jax.Array
+    """[H] m, world x of the hurdles' centres, ascending."""
+    passed: jax.Array
+    """int32, hurdles passed so far: the index of the next one."""
+    stepped_in: jax.Array
+    """[H] bool, a foot was on the ground while the hurdle was being crossed."""
+    cleared: jax.Array
+    """[H] bool, passed with all feet off the ground during the whole crossing."""
+
+
+@flax.struct.dataclass
+class Crossing:
+    """What the substeps of one control step mean for the hurdles."""
+
+    hit: jax.Array
+    """bool, a part of the robot touched a hurdle."""
+    stepped_in: jax.Array
+    """[H] bool, see ``bands.stepped_in``."""
+    last_foot: jax.Array
+    """m, world x of the hindmost foot at the end of the step."""
+
+
+def watch(
+    scene: Scene, dynamics: Dynamics, qpos_trace: jax.Array, positions: jax.Array
+) -> Crossing:
+    """Test every physics substep ``qpos_trace`` [S, 19] against hurdles at ``positions`` [H]."""
+    points = kinematics.forward(qpos_trace)
+    x = points.endpoints[..., 0]
+    height = points.endpoints[..., 2] - base.ground_at(scene, dynamics, points.endpoints[..., :2])
+    radii = jnp.asarray(a1.CONTACT_RADII, jnp.float32)
+    band = bands.nearest(positions, qpos_trace[:, 0])
+    feet = np.flatnonzero(base.FEET)
+    return Crossing(
+        hit=jnp.any(bands.shape_distance(x, height, radii, band) <= 0.0),
+        stepped_in=bands.stepped_in(
+            positions, x[:, feet, 0], height[:, feet, 0] < a1.FOOT_RADIUS + FOOT_CONTACT
+        ),
+        last_foot=jnp.min(x[-1, feet, 0]),
+    )
+
+
+def advance(state: HurdlesState, crossing: Crossing, x: jax.Array) -> HurdlesState:
+    """Return the state after a control step that ends with the root at ``x`` in m."""
+    beyond = state.positions + PASSED < x
+    stepped_in = state.stepped_in | crossing.stepped_in
+    behind = crossing.last_foot > state.positions + bands.HURDLE_LENGTH / 2
+    return state.replace(
+        passed=jnp.maximum(state.passed, jnp.sum(beyond, dtype=jnp.int32)),
+        stepped_in=stepped_in,
+        cleared=state.cleared | (beyond & behind & ~stepped_in),
+    )
+
+
+def next_goal(state: HurdlesState) -> jax.Array:
+    """Return the goal [2] in m: the next hurdle's centre, straight ahead of the start."""
+    index = jnp.minimum(state.passed, state.positions.shape[0] - 1)
+    return jnp.stack([state.positions[index], state.start[1]])
+
+
+class Hurdles:
+    """See the module docstring."""
+
+    name = "hurdles"
+    collision: CollisionSet = "legs"
+    metric_names = (
+        *WEIGHTS, "hurdles_passed", "clean_clearances", "hit_hurdle", "fall", "distance_x",
+        "goal_distance",
+    )  # fmt: skip
+
+    def __init__(self, config: TrainConfig) -> None:
+        """Keep the options of the task.
+
+        Raises:
+            ValueError: Gaps are out of order, or so small that two hurdles are within reach.
+        """
+        options = config.hurdles
+        self._options = options
+        self._gaps = (options.min_gap, options.max_gap)
+        if config.fixed_course:
+            self._gaps = (options.fixed_gap, options.fixed_gap)
+        low, high = self._gaps
+        if not bands.MIN_GAP <= low <= high:
+            raise ValueError(
+                f"hurdles have gaps from {low} to {high} m: the smallest must be at least"
+                f" {bands.MIN_GAP} m and the largest no smaller"
+                f" (nearest: {max(low, bands.MIN_GAP)} to {max(low, high, bands.MIN_GAP)})"
+            )
+        seconds = config.env.episode_length * CONTROL_DT
+        self.num_hurdles = math.ceil(seconds * MAX_SPEED / low) + 1
+        """H, never all passed in an episode."""
+        self.observer = ProprioceptiveObserver(axes=False)
+
+    def start(self, key: jax.Array, scene: Scene, dynamics: Dynamics) -> base.Start:
+        """Start on four feet, the first hurdle as far ahead as the others are apart."""
+        pose_key, place_key, band_key = jax.random.split(key, 3)
+        qpos, qvel = base.start_on_feet(pose_key, scene, dynamics)
+        if scene.kind == "bumpy":
+            low, high = BUMPY_START_X
+            x = jax.random.uniform(place_key, minval=low, maxval=high)
+            qpos = base.place_on_ground(scene, dynamics, qpos.at[0].set(x))
+        none = jnp.zeros(self.num_hurdles, bool)
+        state = HurdlesState(
+            start=qpos[:2],
+            positions=qpos[0] + bands.draw(band_key, self.num_hurdles, *self._gaps),
+            passed=jnp.zeros((), jnp.int32),
+            stepped_in=none,
+            cleared=none,
+        )
+        return base.Start(
+            qpos=qpos,
+            qvel=qvel,
+            goal=next_goal(state),
+            memory=self.observer.init(qpos, qvel),
+            task=state,
+        )
+
+    def judge(self, world: base.World, view: base.View, scene: Scene) -> base.Outcome:
+        """Score one control step."""
+        crossing = watch(scene, world.dynamics, view.qpos_trace, world.task.positions)
+        state = advance(world.task, crossing, view.qpos[0])
+        event = self._options.hurdle_bonus == "event"
+        terms = {
+            "forward": rewards.forward(view.qvel[0]),
+            "orientation": rewards.orientation(frames.rotation_angle(view.qpos[3:7])),
+            "joint_calm": rewards.joint_calm(view.qvel[6:]),
+            "hurdle": (state.passed - world.task.passed if event else state.passed) * 1.0,
+        }
+        goal = next_goal(state)
+        fall = base.touches(view, a1.TRUNK)
+        return base.Outcome(
+            reward=sum((WEIGHTS[name] * term for name, term in terms.items()), jnp.zeros(())),
+            terminated=crossing.hit | fall,
+            goal=goal,
+            task=state,
+            metrics=terms
+            | {
+                "hurdles_passed": state.passed,
+                "clean_clearances": jnp.sum(state.cleared),
+                "hit_hurdle": crossing.hit,
+                "fall": fall,
+                "distance_x": view.qpos[0] - state.start[0],
+                "goal_distance": jnp.linalg.norm(goal - view.qpos[:2]),
+            },
+        )

@@ -1,0 +1,326 @@
+"""Task ``imitate``: track a leap clip (Peng et al. 2020). Source of ``hurdles``.
+
+Observation [160]: ``LAYOUT``. Action [12] in [-1, 1]. Reward: the five terms of ``WEIGHTS`` (paper
+Table 2), 1 for a perfect tracker. Episodes start on the reference at a random phase, with its
+velocities. Whenever the clip loops, the reference moves to where the robot is (root xy only).
+Terminates when the root is ``max_root_error`` or ``max_root_angle`` away from the reference, or
+anything but the feet touches the ground. The reference lives on flat ground; on other ground its
+height is taken as a height over the ground under the robot.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from twirl_mjx.assets import asset_path
+from twirl_mjx.config import TrainConfig
+from twirl_mjx.motion.clip import Clip, headings, sample
+from twirl_mjx.motion.formats import read_clip
+from twirl_mjx.sim import a1, frames, kinematics
+from twirl_mjx.sim.dynamics import Dynamics
+from twirl_mjx.sim.scene import CONTROL_DT, CollisionSet, Scene
+from twirl_mjx.tasks import base, rewards
+from twirl_mjx.tasks.observations import HISTORY, Entry
+
+WEIGHTS = {
+    "pose": 0.5,
+    "velocity": 0.05,
+    "root_pose": 0.15,
+    "root_velocity": 0.1,
+    "end_effector": 0.2,
+}
+"""Weights of the reward terms (paper Table 2); they sum to 1."""
+
+TARGET_STEPS = (1, 2, 7, 20)
+"""Control steps ahead of the target poses in the observation (spec section 5)."""
+
+FLIGHT_STEPS = 4
+"""Control steps in a row with all feet off the ground (at least 0.15 s) that make a flight."""
+
+LAYOUT: tuple[Entry, ...] = (
+    *(
+        Entry(f"{name}[{i - HISTORY + 1}]", size, unit)
+        for i in range(HISTORY)
+        for name, size, unit in (
+            ("base_quat_h", 4, "1"),
+            ("joint_pos", 12, "rad"),
+            ("previous_action", 12, "1"),
+        )
+    ),
+    *(
+        Entry(f"target_{name}[+{step}]", size, unit)
+        for step in TARGET_STEPS
+        for name, size, unit in (
+            ("base_displacement_h", 3, "m"),
+            ("base_quat_h", 4, "1"),
+            ("joint_pos", 12, "rad"),
+        )
+    ),
+)
+"""Layout of the observation, 160 numbers; ``_h``: in the robot's present heading frame (world axes
+turned by its yaw; in the history, by its yaw at that time). Quaternions wxyz with w >= 0."""
+
+
+def load_clip(name: str) -> Clip:
+    """Return the clip of a config, turned to face +x on average.
+
+    Args:
+        name: ``leap`` for the shipped clip, else the path of a clip file.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: The file is not a clip, or its motion does not go on after its last frame.
+    """
+    clip = read_clip(asset_path("a1", "leap.json") if name == "leap" else Path(name))
+    if clip.loop != "wrap":
+        raise ValueError(
+            f"imitate.clip {name!r} has loop mode {clip.loop!r}, which ends after one cycle;"
+            " need 'wrap'"
+        )
+    return facing_x(clip)
+
+
+def facing_x(clip: Clip) -> Clip:
+    """Return the clip turned about the world z-axis so that its mean heading is +x."""
+    yaw = headings(clip.root_quat)
+    mean = np.arctan2(np.sin(yaw).mean(), np.cos(yaw).mean())
+    turn = Rotation.from_euler("z", -mean)
+    quat = turn * Rotation.from_quat(clip.root_quat, scalar_first=True)
+    return Clip(
+        root_pos=turn.apply(clip.root_pos),
+        root_quat=quat.as_quat(scalar_first=True),
+        joint_pos=clip.joint_pos,
+        frame_duration=clip.frame_duration,
+        loop=clip.loop,
+        cycle_offset_position=clip.cycle_offset_position,
+        cycle_offset_rotation=clip.cycle_offset_rotation,
+        name=clip.name,
+    )
+
+
+def to_heading(quat: jax.Array, yaw: jax.Array) -> jax.Array:
+    """Return orientations [..., 4] as seen from the heading ``yaw`` in rad, with w >= 0."""
+    turned = frames.multiply(frames.from_yaw(-yaw), quat)
+    return jnp.where(turned[..., :1] < 0.0, -turned, turned)
+
+
+def feet_from_root(qpos: jax.Array) -> jax.Array:
+    """Return the feet [4, 3] in m relative to the root, in the robot's heading frame."""
+    tilt = to_heading(qpos[3:7], frames.yaw(qpos[3:7]))
+    return frames.rotate(tilt, kinematics.foot_positions(qpos[7:]))
+
+
+@flax.struct.dataclass
+class ImitateMemory:
+    """Memory of :class:`ImitateObserver`: the reference's clock and place, and a history."""
+
+    start_time: jax.Array
+    """s, clip time at the start of the episode."""
+    step: jax.Array
+    """int32, control steps since then."""
+    offset: jax.Array
+    """[2] m, added to the clip's root xy."""
+    history: jax.Array
+    """[3, 28] the last frames of (base quaternion without yaw, joints, action), oldest first."""
+
+    @property
+    def elapsed(self) -> jax.Array:
+        """s since the start of the episode."""
+        return self.step * jnp.float32(CONTROL_DT)
+
+
+class ImitateObserver:
+    """A 3-step history, and where the reference is going, seen from the robot.
+
+    In a foreign task, the reference starts with the clip's first frame where the robot stands.
+    """
+
+    def __init__(self, clip: Clip) -> None:
+        """Keep a wrapping clip."""
+        self.layout = LAYOUT
+        self.duration = clip.cycle_duration
+        """s, length of a cycle."""
+        self._clip = clip.to_arrays()
+
+    def init(self, qpos: jax.Array, qvel: jax.Array) -> ImitateMemory:
+        """Start the clip at its first frame, at the robot's place."""
+        return self.init_at(jnp.zeros((), jnp.float32), qpos, qvel)
+
+    def init_at(self, time: jax.Array, qpos: jax.Array, qvel: jax.Array) -> ImitateMemory:
+        """Start the clip at ``time`` in s, at the robot's place."""
+        del qvel
+        return ImitateMemory(
+            start_time=time,
+            step=jnp.zeros((), jnp.int32),
+            offset=self._offset(time, qpos),
+            history=jnp.tile(_frame(qpos, jnp.zeros(12, jnp.float32)), (HISTORY, 1)),
+        )
+
+    def push(
+        self, memory: ImitateMemory, qpos: jax.Array, qvel: jax.Array, action: jax.Array
+    ) -> ImitateMemory:
+        """Advance clock and history; a new cycle starts at the robot's place."""
+        del qvel
+        history = jnp.concatenate([memory.history[1:], _frame(qpos, action)[None]])
+        new = memory.replace(step=memory.step + 1, history=history)
+        time = self.time(new)
+        looped = self.cycles(time) > self.cycles(self.time(memory))
+        return new.replace(offset=jnp.where(looped, self._offset(time, qpos), new.offset))
+
+    def observe(
+        self, memory: ImitateMemory, goal: jax.Array, qpos: jax.Array, qvel: jax.Array
+    ) -> jax.Array:
+        """Return [160] numbers in the order of ``LAYOUT``; the goal is not looked at."""
+        del goal, qvel
+        times = self.time(memory) + CONTROL_DT * jnp.array(TARGET_STEPS, jnp.float32)
+        target = jax.vmap(lambda time: sample(self._clip, time)[0])(times)
+        target = target.at[:, :2].add(memory.offset)
+        yaw = frames.yaw(qpos[3:7])
+        displacement = frames.rotate(frames.from_yaw(-yaw), target[:, :3] - qpos[:3])
+        poses = [displacement, to_heading(target[:, 3:7], yaw), target[:, 7:]]
+        return jnp.concatenate([memory.history.ravel(), jnp.concatenate(poses, axis=1).ravel()])
+
+    def time(self, memory: ImitateMemory) -> jax.Array:
+        """Return the clip time in s, over all cycles."""
+        return memory.start_time + memory.elapsed
+
+    def reference(self, memory: ImitateMemory) -> tuple[jax.Array, jax.Array]:
+        """Return qpos [19] and qvel [18] of the reference at present."""
+        qpos, qvel = sample(self._clip, self.time(memory))
+        return qpos.at[:2].add(memory.offset), qvel
+
+    def cycles(self, elapsed: jax.Array) -> jax.Array:
+        """Return how many whole cycles ``elapsed`` s hold (int32)."""
+        # The margin keeps a cycle of whole control steps from losing one to rounding.
+        return jnp.floor(elapsed / self.duration + 1e-4).astype(jnp.int32)
+
+    def _offset(self, time: jax.Array, qpos: jax.Array) -> jax.Array:
+        """Return the offset [2] in m that puts the reference at the robot's xy at ``time``."""
+        return qpos[:2] - sample(self._clip, time)[0][:2]
+
+
+def _frame(qpos: jax.Array, action: jax.Array) -> jax.Array:
+    """Return one step of the history [28]."""
+    tilt = to_heading(qpos[3:7], frames.yaw(qpos[3:7]))
+    return jnp.concatenate([tilt, qpos[7:], action])
+
+
+@flax.struct.dataclass
+class ImitateState:
+    """State of the task in one world."""
+
+    airborne_steps: jax.Array
+    """int32, control steps in a row with all feet off the ground."""
+    flew: jax.Array
+    """bool, a flight of ``FLIGHT_STEPS`` was reached in the present cycle."""
+    flights: jax.Array
+    """int32, completed cycles with such a flight."""
+
+
+class Imitate:
+    """See the module docstring."""
+
+    name = "imitate"
+    collision: CollisionSet = "feet"
+    metric_names = (
+        *WEIGHTS, "tracking", "leaps", "flights", "airborne", "root_error", "root_angle",
+        "fall", "lost",
+    )  # fmt: skip
+
+    def __init__(self, config: TrainConfig) -> None:
+        """Load the clip.
+
+        Raises:
+            FileNotFoundError: ``config.imitate.clip`` does not exist.
+            ValueError: It is not a clip, or does not wrap.
+        """
+        self._config = config
+        self.observer = ImitateObserver(load_clip(config.imitate.clip))
+
+    def start(self, key: jax.Array, scene: Scene, dynamics: Dynamics) -> base.Start:
+        """Start on the reference; phase = U(0, cycle)."""
+        place_key, phase_key = jax.random.split(key)
+        phase = jax.random.uniform(phase_key, maxval=self.observer.duration)
+        xy = base.start_xy(place_key, scene)
+        anywhere = jnp.zeros(19).at[:2].set(xy).at[3].set(1.0)
+        memory = self.observer.init_at(phase, anywhere, jnp.zeros(18))
+        qpos, qvel = self.observer.reference(memory)
+        qpos = qpos.at[2].add(base.ground_at(scene, dynamics, xy))
+        endpoints = kinematics.forward(qpos).endpoints
+        lowest = jnp.min(base.clearances(scene, dynamics, endpoints))
+        qpos = qpos.at[2].add(jnp.maximum(-lowest, 0.0))
+        return base.Start(
+            qpos=qpos,
+            qvel=qvel,
+            goal=xy,
+            memory=self.observer.init_at(phase, qpos, qvel),
+            task=ImitateState(
+                airborne_steps=jnp.zeros((), jnp.int32),
+                flew=jnp.zeros((), bool),
+                flights=jnp.zeros((), jnp.int32),
+            ),
+        )
+
+    def judge(self, world: base.World, view: base.View, scene: Scene) -> base.Outcome:
+        """Score one control step against the reference at its end."""
+        options, qpos, qvel = self._config.imitate, view.qpos, view.qvel
+        ref_qpos, ref_qvel = self.observer.reference(world.memory)
+        root_error = jnp.append(qpos[:2], view.height) - ref_qpos[:3]
+        turn = frames.multiply(frames.conjugate(ref_qpos[3:7]), qpos[3:7])
+        angle = frames.rotation_angle(turn)
+        spin = frames.rotate(qpos[3:7], qvel[3:6]) - frames.rotate(ref_qpos[3:7], ref_qvel[3:6])
+        terms = {
+            "pose": rewards.joint_tracking(qpos[7:] - ref_qpos[7:]),
+            "velocity": rewards.joint_vel_tracking(qvel[6:] - ref_qvel[6:]),
+            "root_pose": rewards.root_tracking(root_error, angle),
+            "root_velocity": rewards.root_vel_tracking(qvel[:3] - ref_qvel[:3], spin),
+            "end_effector": rewards.foot_tracking(feet_from_root(qpos) - feet_from_root(ref_qpos)),
+        }
+        reward = sum((WEIGHTS[name] * term for name, term in terms.items()), jnp.zeros(()))
+        distance = jnp.linalg.norm(root_error)
+        fall = base.touches(view, a1.TRUNK, a1.HIP, a1.THIGH, a1.CALF)
+        lost = (distance > options.max_root_error) | (angle > options.max_root_angle)
+        airborne = jnp.all(base.foot_clearance(view) > base.LIFTED)
+        leaps = self.observer.cycles(world.memory.elapsed)
+        completed = leaps > self.observer.cycles(world.memory.elapsed - CONTROL_DT)
+        task = count_flights(world.task, airborne, completed)
+        return base.Outcome(
+            reward=reward,
+            terminated=fall | lost,
+            goal=world.goal,
+            task=task,
+            metrics=terms
+            | {
+                "tracking": reward / sum(WEIGHTS.values()),
+                "leaps": leaps,
+                "flights": task.flights,
+                "airborne": airborne,
+                "root_error": distance,
+                "root_angle": angle,
+                "fall": fall,
+                "lost": lost,
+            },
+        )
+
+
+def count_flights(state: ImitateState, airborne: jax.Array, completed: jax.Array) -> ImitateState:
+    """Return the flight count after a control step.
+
+    Args:
+        state: Before the step.
+        airborne: Whether all feet are off the ground at its end.
+        completed: Whether a cycle ended with it.
+    """
+    steps = jnp.where(airborne, state.airborne_steps + 1, 0)
+    flew = state.flew | (steps == FLIGHT_STEPS)
+    return ImitateState(
+        airborne_steps=steps,
+        flew=flew & ~completed,
+        flights=state.flights + (flew & completed),
+    )

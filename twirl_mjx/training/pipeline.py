@@ -1,0 +1,296 @@
+"""From one command to a trained policy: source, collection, training; each stage resumes.
+
+``train TASK`` = find or train the source policy -> collect its experience in the target task ->
+TWiRL. The variants are settings of the same program (spec section 1). Under a dynamics shift the
+source is a finished nominal run of the same task, and its replay is the source data.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from twirl_mjx.assets import asset_path
+from twirl_mjx.config import SOURCE_OF, TrainConfig
+from twirl_mjx.droq.state import DroqState
+from twirl_mjx.policies import scripted
+from twirl_mjx.policies.function import from_policy
+from twirl_mjx.policies.learned import NumpyPolicy, load_policy
+from twirl_mjx.policies.source import LearnedSource
+from twirl_mjx.presets import PRESETS, make_config
+from twirl_mjx.replay import dataset, ring
+from twirl_mjx.tasks.registry import make_env, make_task
+from twirl_mjx.training import loop, rundir
+from twirl_mjx.training.checkpoint import load_learner, load_replay
+from twirl_mjx.training.source import collect
+from twirl_mjx.types import SourcePolicy
+
+Say = Callable[[str], None]
+
+
+@dataclasses.dataclass(frozen=True)
+class Source:
+    """A resolved source: the policy, where it came from, and its run if it has one."""
+
+    policy: SourcePolicy
+    origin: str
+    digest: str
+    numpy_policy: Any = None
+    run_dir: Path | None = None
+
+
+class StoppedError(RuntimeError):
+    """A stage was stopped by a signal; the same command resumes."""
+
+
+def run(config: TrainConfig, preset: str, runs_dir: Path, name: str | None, say: Say) -> Path:
+    """Train a task to its budget, with every stage before it that is missing.
+
+    Args:
+        config: The run.
+        preset: Preset the config came from; the source run, if one is needed, uses the same.
+        runs_dir: Folder of all runs.
+        name: Name of the run; derived from the config by default.
+        say: Prints one line for a person.
+
+    Returns:
+        The run directory.
+
+    Raises:
+        StoppedError: A signal stopped a stage after saving it.
+        ValueError: The variant does not fit the task, or the source does not fit the variant.
+    """
+    run_dir = runs_dir / (name or rundir.default_name(config, preset))
+    if config.task not in SOURCE_OF and config.shift == "none" and config.variant != "scratch":
+        raise ValueError(
+            f"task {config.task} has no source policy, so variant {config.variant!r} does not"
+            " apply (nearest: 'scratch')"
+        )
+    if config.variant == "scratch":
+        return _train(config, run_dir, None, None)
+    source = find_source(config, preset, runs_dir, say)
+    if config.variant == "zero-shot":
+        return zero_shot(config, run_dir, source, say)
+    data = source_data(config, run_dir, source, say) if config.uses_source_data else None
+    initial = None
+    if config.variant in ("weights", "twirl+weights"):
+        initial = source_weights(config, source, say)
+    return _train(config, run_dir, data, initial)
+
+
+def _train(
+    config: TrainConfig,
+    run_dir: Path,
+    data: ring.RingBuffer | None,
+    initial: Callable[[DroqState], DroqState] | None,
+) -> Path:
+    outcome = loop.train(config, run_dir, source=data, initial=initial, stage=config.task)
+    if not outcome.finished:
+        raise StoppedError(f"{run_dir.name} stopped at {outcome.env_steps:,} transitions")
+    return run_dir
+
+
+def find_source(config: TrainConfig, preset: str, runs_dir: Path, say: Say) -> Source:
+    """Return the source policy of a run, training it first when there is none.
+
+    ``config.source`` is ``auto`` (the policy shipped in ``assets/policies``, else a run of the
+    source task, else train one), ``train``, the name of a scripted policy, or a path.
+
+    Raises:
+        StoppedError: Training the source was stopped.
+        FileNotFoundError: A path that does not exist, or no finished nominal run under a shift.
+    """
+    wanted = config.source
+    if wanted in scripted.SCRIPTED:
+        return Source(scripted.get_scripted(wanted), f"scripted {wanted}", wanted)
+    if wanted not in ("auto", "train"):
+        return _from_path(config, Path(wanted))
+    if config.shift != "none":
+        return _nominal_run(config, preset, runs_dir)
+    source_task = SOURCE_OF[config.task]
+    shipped = f"policies/{source_task}.npz"
+    if wanted == "auto" and preset != "debug":
+        try:
+            path = asset_path(*shipped.split("/"))
+        except FileNotFoundError:
+            say(f"no shipped {source_task} policy: training one first")
+        else:
+            say(f"source: the shipped policy assets/{shipped} (--source train trains your own)")
+            return _from_path(config, path)
+    source_config = dataclasses.replace(make_config(source_task, preset), seed=config.seed)
+    source_dir = runs_dir / rundir.default_name(source_config, preset)
+    say(f"stage 1 of 3: source policy, task {source_task}, in {source_dir}")
+    _train(source_config, source_dir, None, None)
+    return _from_path(config, source_dir)
+
+
+def _nominal_run(config: TrainConfig, preset: str, runs_dir: Path) -> Source:
+    """Return the finished run of the same task without a shift."""
+    nominal = dataclasses.replace(config, shift="none", variant="twirl", source="auto")
+    presets = (preset, *(p for p in PRESETS if p != preset))
+    tried = [runs_dir / rundir.default_name(nominal, p) for p in presets]
+    for run_dir in tried:
+        if (run_dir / loop.EVAL_CSV).is_file():
+            return _from_path(config, run_dir)
+    raise FileNotFoundError(
+        f"adapting {config.task} to {config.shift} starts from a finished nominal run;"
+        f" looked for {', '.join(map(str, tried))}. Run `make train TASK={config.task}` first,"
+        " or name a run or policy with --source"
+    )
+
+
+def _from_path(config: TrainConfig, path: Path) -> Source:
+    policy = load_policy(path)
+    digest = hashlib.sha256(path.read_bytes() if path.is_file() else b"").hexdigest()[:12]
+    if not isinstance(policy, NumpyPolicy):
+        return Source(from_policy(policy), str(path), digest, policy)
+    actor = jax.tree.map(jnp.asarray, dict(policy.actor_params))
+    source_config = dataclasses.replace(config, task=policy.header.task)
+    observer = make_task(source_config).observer
+    if path.is_dir():
+        digest = rundir.digest(rundir.read_config(path)) + str(policy.header.card.get("env_steps"))
+    run_dir = path if path.is_dir() else None
+    return Source(LearnedSource(actor, observer), str(path), digest, policy, run_dir)
+
+
+def source_data(
+    config: TrainConfig, run_dir: Path, source: Source, say: Say
+) -> ring.RingBuffer:
+    """Return the frozen source ring: a nominal run's replay, or freshly collected experience.
+
+    Collected data are kept in ``run_dir/source.npz`` and used again while they fit.
+    """
+    env = make_env(config)
+    if config.shift != "none" and source.run_dir is not None:
+        rows = load_replay(source.run_dir)
+        data = ring.from_rows(rows, env.observation_size, env.action_size)
+        say(f"source data: the replay of {source.run_dir}, {len(rows):,} transitions")
+        return data
+    rundir.open_run(run_dir, config)
+    path = run_dir / "source.npz"
+    size = config.replay.source_size
+    digest = collection_digest(config, source)
+    if path.exists():
+        header, data = dataset.read(
+            path,
+            task=config.task,
+            observation_size=env.observation_size,
+            action_size=env.action_size,
+        )
+        if header.digest == digest:
+            say(f"source data: {path}, {header.size:,} transitions of {header.source}")
+            return ring.from_transitions(jax.tree.map(jnp.asarray, data))
+        say(f"{path} was collected for other settings: collecting again")
+    say(f"stage 2 of 3: collecting {size:,} transitions of {source.origin} in {config.task}")
+    data = write_dataset(config, source, path, digest, say)
+    return ring.from_transitions(jax.tree.map(jnp.asarray, data))
+
+
+def collection_digest(config: TrainConfig, source: Source) -> str:
+    """Return a hash of everything that decides a collected dataset."""
+    decides = {
+        "task": config.task,
+        "shift": [config.shift, config.shift_strength],
+        "options": dataclasses.asdict(config)[config.task],
+        "env": dataclasses.asdict(config.env),
+        "seed": config.seed,
+        "size": config.replay.source_size,
+        "source": source.digest,
+    }
+    return hashlib.sha256(json.dumps(decides, sort_keys=True).encode()).hexdigest()[:12]
+
+
+def write_dataset(
+    config: TrainConfig, source: Source, path: Path, digest: str, say: Say
+) -> Any:
+    """Collect ``config.replay.source_size`` transitions and write them to ``path``."""
+    env = make_env(config)
+    key = jax.random.fold_in(jax.random.key(config.seed), 0x50)
+    data, means = collect(env, source.policy, key, config.replay.source_size)
+    say("source policy in the target task: " + describe(means))
+    header = dataset.DatasetHeader(
+        task=config.task,
+        shift=config.shift,
+        source=source.origin,
+        size=len(data.reward),
+        observation_size=env.observation_size,
+        action_size=env.action_size,
+        mean_return=means.get("return", float("nan")),
+        digest=digest,
+    )
+    dataset.write(path, header, data)
+    return data
+
+
+def describe(means: dict[str, float]) -> str:
+    """Return measures as one line of text."""
+    return ", ".join(f"{k} {v:.3g}" for k, v in means.items()) or "no episode ended"
+
+
+def source_weights(
+    config: TrainConfig, source: Source, say: Say
+) -> Callable[[DroqState], DroqState]:
+    """Return a function that writes the source's networks into a fresh learner.
+
+    A run directory gives actor, critics and temperature; a policy file only the actor.
+
+    Raises:
+        ValueError: The source has no networks, or its observations or layer sizes differ.
+    """
+    policy = source.numpy_policy
+    if not isinstance(policy, NumpyPolicy):
+        raise ValueError(f"{source.origin} has no network weights (nearest variant: 'twirl')")
+    layout = make_task(config).observer.layout
+    own = make_task(dataclasses.replace(config, task=policy.header.task)).observer.layout
+    if own != layout:
+        raise ValueError(
+            f"{source.origin} observes as task {policy.header.task}, not as {config.task}:"
+            " its weights do not fit (nearest variant: 'twirl')"
+        )
+    actor = jax.tree.map(jnp.asarray, dict(policy.actor_params))
+    learner = load_learner(source.run_dir) if source.run_dir else None
+    if learner is None:
+        say(f"weights: the actor of {source.origin}; a policy file has no critics")
+
+    def initial(fresh: DroqState) -> DroqState:
+        shapes = jax.tree.map(lambda x: x.shape, (fresh.actor, actor))
+        if shapes[0] != shapes[1]:
+            raise ValueError(
+                f"{source.origin} has layers {shapes[1]}, this run {shapes[0]}: set"
+                " droq.hidden_sizes alike"
+            )
+        if learner is None:
+            return fresh.replace(actor=actor)
+        return fresh.replace(
+            actor=learner["actor"],
+            critic=learner["critic"],
+            target_critic=learner["target_critic"],
+            log_temperature=learner["log_temperature"],
+        )
+
+    return initial
+
+
+def zero_shot(config: TrainConfig, run_dir: Path, source: Source, say: Say) -> Path:
+    """Evaluate the source policy in the target task without training it."""
+    from twirl_mjx.evaluation.rollout import make_evaluate
+
+    rundir.open_run(run_dir, config)
+    env = make_env(loop.eval_config(config), num_envs=config.eval.final_episodes)
+
+    def act(params: Any, memory: Any, state: Any, key: jax.Array) -> tuple[jax.Array, Any]:
+        return source.policy.act(memory, state, key)
+
+    evaluate = make_evaluate(env, source.policy.init, act)
+    values = evaluate(None, jax.random.key(config.eval.seed + 1))
+    loop.write_episodes(run_dir / loop.EVAL_CSV, rundir.identity(run_dir, config), 0, values)
+    say(f"zero-shot: {describe({k: float(np.mean(v)) for k, v in values.items()})}")
+    return run_dir
