@@ -121,6 +121,18 @@ def test_bars_show_the_last_values(icy):
     )
 
 
+def test_episode_bars_pool_the_runs_of_a_variant(tmp_path, write, episodes_of):
+    rows = [row for seed in (0, 3) for row in episodes_of("biped", "icy", "weights", seed)]
+    table = read_table(write(tmp_path / "e.csv", tables.EPISODE_COLUMNS, rows))
+    figure = plots.shift_bars(table, "success", statistic="rate")
+    (bar,) = figure.axes[0].patches
+    assert isinstance(bar, Rectangle)
+    values = [tables.select(table, metric="success", seed=s)["value"] for s in (0, 3)]
+    assert values[0].mean() != values[1].mean()
+    assert bar.get_height() == pytest.approx(np.concatenate(values).mean())
+    assert "over the episodes of 2 seeds per bar" in " ".join(texts(figure))
+
+
 def test_runs_can_be_set_side_by_side(icy):
     (axes,) = plots.shift_bars(icy, "return", by="run").axes
     assert len(axes.patches) == 4

@@ -95,18 +95,20 @@ def test_runs_can_be_summarised_side_by_side(table_of):
 
 
 def test_shift_wins_counts_cells_that_hold_all_rivals(table_of):
-    arms = []
-    for shift, levels in {
-        "icy": (5, 1, 2, 3),
-        "bumpy": (1, 1, 2, 3),
-        "sloped": (1, 4, 2, 3),
-    }.items():
-        for variant, level in zip(
-            ("twirl", "twirl+weights", "weights", "zero-shot"), levels, strict=True
-        ):
-            arms.append(rows(variant, [level, level], shift=shift))
-    arms.append(rows("twirl", [9, 9], shift="gravity"))
-    assert summary.shift_wins(summary.summarise(table_of(*arms), "return")) == (2, 3)
+    variants = ("twirl", "twirl+weights", "weights", "zero-shot")
+    levels = {
+        "icy": (5, 1, 2, 3),  # won by twirl
+        "sloped": (1, 4, 2, 3),  # won by twirl+weights
+        "bumpy": (1, 1, 2, 3),  # lost to both
+        "weakened": (2.5, 1, 2, 3),  # lost to one of them
+    }
+    arms = [
+        rows(variant, [level, level], shift=shift)
+        for shift, values in levels.items()
+        for variant, level in zip(variants, values, strict=True)
+    ]
+    arms.append(rows("twirl", [9, 9], shift="gravity"))  # no rival, not compared
+    assert summary.shift_wins(summary.summarise(table_of(*arms), "return")) == (2, 4)
 
 
 def test_main_metric_is_what_all_runs_report(table_of):
