@@ -187,6 +187,8 @@ class EnvConfig:
     """Worlds stepped together."""
     episode_length: int = 400
     """Control steps of an episode (20 s at 20 Hz)."""
+    train_episode_length: int | None = None
+    """Control steps before truncation while training; ``episode_length`` when not given."""
     engine: Literal["auto", "mjx", "native"] = "auto"
     """Physics engine; auto is mjx on an accelerator and native (C MuJoCo threads) on a CPU."""
     course: Literal["auto", "random", "fixed"] = "auto"
@@ -200,6 +202,8 @@ class EnvConfig:
         """
         check_range("env.num_envs", self.num_envs, 1, 1_000_000)
         check_range("env.episode_length", self.episode_length, 1, 1_000_000)
+        if self.train_episode_length is not None:
+            check_range("env.train_episode_length", self.train_episode_length, 1, 1_000_000)
         check_choice("env.engine", self.engine, ("auto", "mjx", "native"))
         check_choice("env.course", self.course, ("auto", "random", "fixed"))
 

@@ -40,7 +40,7 @@ def _cpu(task: str) -> TrainConfig:
         total_env_steps=CPU_ENV_STEPS[task],
         warmup_env_steps=6400,
         epoch_env_steps=3200,
-        env=EnvConfig(num_envs=64),
+        env=EnvConfig(num_envs=64, train_episode_length=100 if task == "stand" else None),
         droq=DroqConfig(
             hidden_sizes=(128, 128), utd=0.5, updates_per_block=8, initial_temperature=0.1
         ),

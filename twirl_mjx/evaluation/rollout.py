@@ -25,6 +25,7 @@ def first_episodes(
     params: Any,
     key: jax.Array,
     dynamics: Dynamics | None = None,
+    index: jax.Array | None = None,
 ) -> dict[str, jax.Array]:
     """Run one episode in every world and measure it; traceable.
 
@@ -35,6 +36,7 @@ def first_episodes(
         params: First argument of ``act``, e.g. network parameters.
         key: Seeds both the worlds and the policy.
         dynamics: Physical parameters, leaves () or [N]; the env's by default.
+        index: [N] number of every episode; equal numbers start alike. 0 to N - 1 by default.
 
     Returns:
         Every measure of the task and ``success``, each [N]; steps after the first end of a world
@@ -42,7 +44,7 @@ def first_episodes(
     """
     task = env.task.name
     reset_key, act_key = jax.random.split(key)
-    state = env.reset(reset_key, dynamics)
+    state = env.reset(reset_key, dynamics, index)
 
     def step(carry: tuple, step_key: jax.Array) -> tuple[tuple, None]:
         state, memory, tracker, alive, broken = carry
@@ -68,13 +70,19 @@ def first_episodes(
 
 def make_evaluate(
     env: VectorEnv, init_memory: Callable[[EnvState], Any], act: ActFn
-) -> Callable[[Any, jax.Array], dict[str, np.ndarray]]:
-    """Return ``evaluate(params, key)``: compiled first episodes, measures as numpy arrays [N]."""
+) -> Callable[..., dict[str, np.ndarray]]:
+    """Return a compiled :func:`first_episodes`: ``evaluate(params, key, dynamics, index)``.
+
+    Measures come back as numpy arrays [N].
+    """
     run = jax.jit(functools.partial(first_episodes, env, init_memory, act))
 
     def evaluate(
-        params: Any, key: jax.Array, dynamics: Dynamics | None = None
+        params: Any,
+        key: jax.Array,
+        dynamics: Dynamics | None = None,
+        index: jax.Array | None = None,
     ) -> dict[str, np.ndarray]:
-        return {k: np.asarray(v) for k, v in run(params, key, dynamics).items()}
+        return {k: np.asarray(v) for k, v in run(params, key, dynamics, index).items()}
 
     return evaluate

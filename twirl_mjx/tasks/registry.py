@@ -59,7 +59,7 @@ def make_env(
         scene,
         make_engine(config.env.engine, scene, threads),
         num_envs=num_envs or config.env.num_envs,
-        episode_length=config.env.episode_length,
+        episode_length=config.env.train_episode_length or config.env.episode_length,
         dynamics=make_dynamics(config.shift, config.shift_strength),
     )
 

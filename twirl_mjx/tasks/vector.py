@@ -99,18 +99,26 @@ class VectorEnv:
         """The compiled model of the scene."""
         return self.scene.mj_model
 
-    def reset(self, key: jax.Array, dynamics: Dynamics | None = None) -> EnvState:
+    def reset(
+        self,
+        key: jax.Array,
+        dynamics: Dynamics | None = None,
+        index: jax.Array | None = None,
+    ) -> EnvState:
         """Start an episode in every world.
 
         Args:
             key: PRNG key; world ``i`` draws from ``fold_in(key, i)``, whatever N is.
             dynamics: Physical parameters of this batch, leaves () or [N]; the env's by default.
+            index: [N] int, the number ``i`` of every world; 0 to N - 1 by default. Worlds of
+                equal number draw alike.
 
         Returns:
             A state whose ``next_obs`` equals ``obs``, with reward 0 and all flags false.
         """
         dynamics = self.dynamics if dynamics is None else broadcast(dynamics, self.num_envs)
-        keys = jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(self.num_envs))
+        index = jnp.arange(self.num_envs) if index is None else index
+        keys = jax.vmap(jax.random.fold_in, (None, 0))(key, index)
         qpos, qvel, world, obs = jax.vmap(self._start_world)(keys, dynamics)
         data = _place(make_data(self.scene, self.num_envs), qpos, qvel)
         flags = jnp.zeros(self.num_envs, bool)

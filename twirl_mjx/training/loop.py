@@ -84,9 +84,11 @@ def no_memory(env_state: Any) -> tuple[()]:
 
 
 def eval_config(config: TrainConfig) -> TrainConfig:
-    """Return the config of evaluation: every episode starts as the task says."""
+    """Return the config of evaluation: episodes start and last as the task says."""
     return dataclasses.replace(
-        config, stand=dataclasses.replace(config.stand, risen_fraction=0.0)
+        config,
+        stand=dataclasses.replace(config.stand, risen_fraction=0.0),
+        env=dataclasses.replace(config.env, train_episode_length=None),
     )
 
 

@@ -22,9 +22,8 @@ from twirl_mjx.assets import asset_path
 from twirl_mjx.config import SOURCE_OF, TrainConfig
 from twirl_mjx.droq.state import DroqState
 from twirl_mjx.policies import scripted
-from twirl_mjx.policies.function import from_policy
-from twirl_mjx.policies.learned import NumpyPolicy, load_policy
-from twirl_mjx.policies.source import LearnedSource
+from twirl_mjx.policies.learned import NumpyPolicy
+from twirl_mjx.policies.resolve import resolve_policy
 from twirl_mjx.presets import PRESETS, make_config
 from twirl_mjx.replay import dataset, ring
 from twirl_mjx.tasks.registry import make_env, make_task
@@ -148,17 +147,13 @@ def _nominal_run(config: TrainConfig, preset: str, runs_dir: Path) -> Source:
 
 
 def _from_path(config: TrainConfig, path: Path) -> Source:
-    policy = load_policy(path)
-    digest = hashlib.sha256(path.read_bytes() if path.is_file() else b"").hexdigest()[:12]
-    if not isinstance(policy, NumpyPolicy):
-        return Source(from_policy(policy), str(path), digest, policy)
-    actor = jax.tree.map(jnp.asarray, dict(policy.actor_params))
-    source_config = dataclasses.replace(config, task=policy.header.task)
-    observer = make_task(source_config).observer
+    found = resolve_policy(str(path), config)
     if path.is_dir():
-        digest = rundir.digest(rundir.read_config(path)) + str(policy.header.card.get("env_steps"))
-    run_dir = path if path.is_dir() else None
-    return Source(LearnedSource(actor, observer), str(path), digest, policy, run_dir)
+        progress = found.loaded.header.card.get("env_steps")
+        digest = f"{rundir.digest(rundir.read_config(path))}@{progress}"
+        return Source(found.policy, str(path), digest, found.loaded, path)
+    digest = hashlib.sha256(path.read_bytes()).hexdigest()[:12]
+    return Source(found.policy, str(path), digest, found.loaded)
 
 
 def source_data(

@@ -1,0 +1,30 @@
+"""``twirl report``."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+from twirl_mjx.commands.options import parse, say
+
+
+@dataclasses.dataclass(frozen=True)
+class ReportOptions:
+    """Write the results as one HTML page that opens offline; needs no jax."""
+
+    results: Path = Path("experiments/results")
+    """Folder with <grid>/<arm>.csv."""
+    out: Path = Path("runs/report.html")
+    """The page."""
+    media: tuple[Path, ...] = ()
+    """Films and pictures to show, in order."""
+
+
+def main(argv: list[str]) -> int:
+    """Write the page."""
+    from twirl_mjx.figures.report import write_report
+
+    options = parse(ReportOptions, argv, "twirl report")
+    options.out.parent.mkdir(parents=True, exist_ok=True)
+    say(f"wrote {write_report(options.results, options.out, options.media)}")
+    return 0

@@ -1,0 +1,83 @@
+"""Record the motion of a policy for pictures: one world, one episode."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import jax
+import numpy as np
+
+from twirl_mjx.config import TrainConfig
+from twirl_mjx.tasks.registry import make_env
+from twirl_mjx.types import SourcePolicy
+
+
+@dataclasses.dataclass(frozen=True)
+class Recording:
+    """One episode of one world."""
+
+    qpos: np.ndarray
+    """[T, 19] at the end of every control step; the last state before the episode ended."""
+    goals: np.ndarray
+    """[T, 2] m."""
+    reward: np.ndarray
+    """[T]."""
+    metrics: dict[str, np.ndarray]
+    """Per-step task metrics, each [T]."""
+    hurdles: tuple[float, ...]
+    """x of the hurdle bands of the episode, m; empty in tasks without."""
+
+
+def record_episode(
+    config: TrainConfig, policy: SourcePolicy, *, seed: int, steps: int | None = None
+) -> Recording:
+    """Roll one episode out.
+
+    Args:
+        config: Task, shift and options.
+        policy: Any policy that acts in the task's worlds.
+        seed: Seed of the episode.
+        steps: Control steps at most; the episode length by default.
+    """
+    env = make_env(config, num_envs=1)
+    reset_key, act_key = jax.random.split(jax.random.key(seed))
+    state = jax.jit(env.reset)(reset_key)
+    memory = policy.init(state)
+    task_state: Any = state.world.task
+    hurdles = np.asarray(getattr(task_state, "positions", np.zeros((1, 0))))[0]
+
+    @jax.jit
+    def step(state: Any, memory: Any, key: jax.Array) -> tuple[Any, Any]:
+        action, memory = policy.act(memory, state, key)
+        return env.step(state, action), memory
+
+    rows: list[tuple[np.ndarray, ...]] = []
+    metrics: list[dict[str, np.ndarray]] = []
+    keys = jax.random.split(act_key, steps or config.env.episode_length)
+    for key in keys:
+        goal = np.asarray(state.world.goal[0])
+        before = np.asarray(state.data.qpos[0])
+        state, memory = step(state, memory, key)
+        ended = bool(state.done[0])
+        # After an auto-reset the data are those of the next episode.
+        qpos = before if ended else np.asarray(state.data.qpos[0])
+        rows.append((qpos, goal, np.asarray(state.reward[0])))
+        metrics.append({k: np.asarray(v[0]) for k, v in state.metrics.items()})
+        if ended:
+            break
+    qpos, goals, reward = (np.stack(column) for column in zip(*rows, strict=True))
+    stacked = jax.tree.map(lambda *x: np.stack(x), *metrics)
+    return Recording(qpos, goals, reward, stacked, tuple(float(x) for x in hurdles))
+
+
+def scene_model(config: TrainConfig, hurdles: tuple[float, ...] = ()) -> Any:
+    """Return the ``mujoco.MjModel`` to draw a config's episodes in."""
+    from twirl_mjx.sim.dynamics import get_shift, make_dynamics
+    from twirl_mjx.sim.scene import build_scene
+
+    scene = build_scene(get_shift(config.shift).scene, hurdles=hurdles)
+    if scene.kind == "bumpy":
+        height = float(make_dynamics(config.shift, config.shift_strength).bump_height)
+        scene.mj_model.hfield_size[0, 2] = max(height, 1e-4)
+    return scene.mj_model

@@ -1,0 +1,66 @@
+"""One policy across all dynamics conditions: one compiled call per kind of ground."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from twirl_mjx.config import TrainConfig
+from twirl_mjx.evaluation.rollout import make_evaluate
+from twirl_mjx.sim.dynamics import SHIFTS, SceneKind, make_dynamics, stack
+from twirl_mjx.tasks.registry import make_env
+from twirl_mjx.types import SourcePolicy
+
+
+def scenes_of(shifts: tuple[str, ...]) -> dict[SceneKind, list[str]]:
+    """Group shifts by the ground they need."""
+    groups: dict[SceneKind, list[str]] = {}
+    for shift in shifts:
+        groups.setdefault(SHIFTS[shift].scene, []).append(shift)
+    return groups
+
+
+def evaluate_shifts(
+    config: TrainConfig,
+    policy: SourcePolicy,
+    *,
+    episodes: int,
+    seed: int,
+    shifts: tuple[str, ...] = tuple(SHIFTS),
+    strength: float = 1.0,
+) -> dict[str, dict[str, np.ndarray]]:
+    """Evaluate a policy under several conditions on one fixed course.
+
+    Episode ``e`` of every condition starts from the same draws, so that conditions differ by
+    their physics alone (and by the ground under the start).
+
+    Args:
+        config: Task and its options; its shift is ignored.
+        policy: Any policy that acts in the task's worlds.
+        episodes: E, episodes per condition.
+        seed: Seed of the episodes.
+        shifts: Names of the conditions.
+        strength: Strength of every shift.
+
+    Returns:
+        Per shift, every measure as an array [E].
+    """
+
+    def act(params: Any, memory: Any, state: Any, key: jax.Array) -> tuple[jax.Array, Any]:
+        return policy.act(memory, state, key)
+
+    fixed = dataclasses.replace(config, env=dataclasses.replace(config.env, course="fixed"))
+    found: dict[str, dict[str, np.ndarray]] = {}
+    for kind, names in scenes_of(shifts).items():
+        env = make_env(fixed, num_envs=episodes * len(names), scene_kind=kind)
+        dynamics = stack([make_dynamics(name, strength) for name in names], episodes)
+        index = jnp.tile(jnp.arange(episodes), len(names))
+        values = make_evaluate(env, policy.init, act)(None, jax.random.key(seed), dynamics, index)
+        for i, name in enumerate(names):
+            part = slice(i * episodes, (i + 1) * episodes)
+            found[name] = {k: v[part] for k, v in values.items()}
+    return {name: found[name] for name in shifts}
