@@ -14,13 +14,15 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = "twirl_mjx"
 
-BASE = {"types", "config", "assets"}
+BASE = {"types", "config", "presets", "config_json", "assets"}
 WORLD = BASE | {"sim", "motion"}
 ACTING = WORLD | {"tasks", "droq", "policies"}
 ALLOWED: dict[str, set[str]] = {
     "types": set(),
     "assets": set(),
     "config": {"types"},
+    "presets": {"config"},
+    "config_json": {"config", "presets"},
     "sim": BASE,
     "motion": WORLD,
     "tasks": WORLD,
@@ -134,12 +136,12 @@ def test_imports_point_down(path: Path) -> None:
     assert not import_faults(source, module_name(path), is_package=path.name == "__init__.py")
 
 
-def test_experiments_import_config_only() -> None:
+def test_experiments_import_settings_only() -> None:
     faults = [
         f"{path.name}: {name}"
         for path in sources("experiments")
         for name in imported_modules(parse(path), module_name(path), is_package=False)
-        if name.split(".")[0] == PACKAGE and part_of(name) != "config"
+        if name.split(".")[0] == PACKAGE and part_of(name) not in {"config", "presets"}
     ]
     assert not faults
 
