@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
-from twirl_mjx.motion.clip import Clip, frame_velocities, sample, slerp
+from twirl_mjx.motion.clip import Clip, configurations, frame_velocities, sample, slerp
 from twirl_mjx.motion.formats import foot_paths, read_clip, write_clip
 from twirl_mjx.sim import a1
 
@@ -87,13 +87,33 @@ def test_cycle_displacement_is_a_repeated_rigid_motion() -> None:
     for cycle in range(1, 4):
         pos, quat = turn.apply(pos - start) + end, turn * quat
         time = cycle * clip.cycle_duration + 2 * clip.frame_duration
-        qpos, qvel = sample(clip.to_arrays(), time)
+        qpos, qvel = (rows[0] for rows in SAMPLE(clip.to_arrays(), jnp.array([time], jnp.float32)))
         np.testing.assert_allclose(qpos[:3], pos, atol=1e-4)
         got = Rotation.from_quat(np.asarray(qpos[3:7]), scalar_first=True)
         assert (got * quat.inv()).magnitude() < 1e-4
         first = frame_velocities(clip)[0][2]
         turned = Rotation.from_euler("z", cycle * yaw).apply(first)
         np.testing.assert_allclose(qvel[:3], turned, atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {},
+        {"cycle_offset_rotation": True},
+        {"cycle_offset_position": False},
+        {"cycle_offset_rotation": True, "cycle_offset_position": False},
+        {"loop": "clamp"},
+    ],
+)
+def test_numpy_and_jax_sampling_agree(changes: dict[str, Any]) -> None:
+    clip = make_clip(yaw_per_cycle=0.7, **changes)
+    times = np.linspace(-0.9, 1.7, 41)
+    qpos, _ = SAMPLE(clip.to_arrays(), jnp.asarray(times, jnp.float32))
+    want = configurations(clip, times)
+    np.testing.assert_allclose(qpos[:, :3], want[:, :3], atol=2e-5)
+    np.testing.assert_allclose(np.abs((qpos[:, 3:7] * want[:, 3:7]).sum(axis=1)), 1.0, atol=1e-5)
+    np.testing.assert_allclose(qpos[:, 7:], want[:, 7:], atol=2e-5)
 
 
 def test_offset_flags_off_repeat_the_first_cycle() -> None:

@@ -15,7 +15,7 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.spatial.transform import Rotation
+from scipy.spatial.transform import Rotation, Slerp
 
 from twirl_mjx.sim import frames
 
@@ -282,3 +282,23 @@ def sample(clip: ClipArrays, time: jax.Array | float) -> tuple[jax.Array, jax.Ar
     if clip.loop == "clamp":
         qvel = jnp.where((time < 0.0) | (time > duration), 0.0, qvel)
     return qpos, qvel
+
+
+def configurations(clip: Clip, times: np.ndarray) -> np.ndarray:
+    """Return qpos [T, 19] at ``times`` [T] s: the positions of ``sample``, in numpy (float64)."""
+    wraps = clip.loop == "wrap"
+    cycle = np.floor(times / clip.cycle_duration) if wraps else np.zeros(len(times))
+    inside = np.clip(times - cycle * clip.cycle_duration, 0.0, clip.cycle_duration)
+    grid = np.linspace(0.0, clip.cycle_duration, clip.num_frames)
+    columns = np.concatenate([clip.root_pos, clip.joint_pos], axis=1).T
+    values = np.stack([np.interp(inside, grid, column) for column in columns], axis=1)
+    rotation = Slerp(grid, Rotation.from_quat(clip.root_quat, scalar_first=True))(inside)
+    x, y, yaw = clip.cycle_displacement
+    # In the complex plane a cycle turns by `turn` about the start and then moves by x + iy.
+    start, turn = complex(*clip.root_pos[0, :2]), np.exp(1j * yaw)
+    powers = turn**cycle
+    moves = cycle if abs(turn - 1) < 1e-9 else (1 - powers) / (1 - turn)
+    place = start + powers * (values[:, 0] + 1j * values[:, 1] - start) + moves * complex(x, y)
+    root = np.stack([place.real, place.imag, values[:, 2]], axis=1)
+    rotation = Rotation.from_rotvec(np.outer(cycle * yaw, [0, 0, 1])) * rotation
+    return np.concatenate([root, rotation.as_quat(scalar_first=True), values[:, 3:]], axis=1)

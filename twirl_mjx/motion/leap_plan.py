@@ -13,11 +13,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from math import comb
-from typing import Protocol
 
 import numpy as np
 
 from twirl_mjx.motion import planar
+from twirl_mjx.motion.leap_config import LeapConfig
 from twirl_mjx.motion.planar import GRAVITY, LinkStates, PlanarModel, Pose
 from twirl_mjx.sim import a1
 
@@ -35,35 +35,6 @@ SWEEPS = 10
 """Fixed-point iterations for the trunk's place and pitch."""
 PAIRS = "FH"
 """Front and hind."""
-
-
-class LeapShape(Protocol):
-    """The part of the leap's settings the plan depends on."""
-
-    @property
-    def cycle_length(self) -> float:
-        """In m."""
-        ...
-
-    @property
-    def flight_time(self) -> float:
-        """In s."""
-        ...
-
-    @property
-    def duration(self) -> float:
-        """In s."""
-        ...
-
-    @property
-    def num_frames(self) -> int:
-        """Frame intervals in a cycle."""
-        ...
-
-    @property
-    def run_up_strides(self) -> int:
-        """Bounds besides the leap."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -95,7 +66,7 @@ class Layout:
         return [f"{pair}{i}" for i in range(1, self.bounds + 1) for pair in PAIRS]
 
 
-def make_layout(config: LeapShape) -> Layout:
+def make_layout(config: LeapConfig) -> Layout:
     """Return the variables of a plan and their first guess: a pronk, front feet a little first."""
     bounds, duration, speed = (
         1 + config.run_up_strides,
@@ -192,7 +163,7 @@ def bernstein(share: np.ndarray, *controls: np.ndarray) -> np.ndarray:
 
 
 def stance_times(
-    config: LeapShape, layout: Layout, params: np.ndarray
+    config: LeapConfig, layout: Layout, params: np.ndarray
 ) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """Return begin and duration [...] in s of every stance.
 
@@ -212,7 +183,7 @@ def stance_times(
 
 
 def feet_and_forces(
-    config: LeapShape, layout: Layout, params: np.ndarray, weight: float
+    config: LeapConfig, layout: Layout, params: np.ndarray, weight: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return foot centres [..., F+1, 2, 2] m and ground forces, same shape, N.
 
@@ -275,7 +246,7 @@ def _accumulate(start: np.ndarray, steps: np.ndarray) -> np.ndarray:
 
 
 def plan_motion(
-    config: LeapShape,
+    config: LeapConfig,
     layout: Layout,
     model: PlanarModel,
     params: np.ndarray,

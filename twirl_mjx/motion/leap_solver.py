@@ -15,17 +15,16 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from scipy import optimize, signal
 
+from twirl_mjx.motion.leap_config import LeapConfig
 from twirl_mjx.motion.leap_plan import (
     INERTIA,
     SLACK_NODES,
     Layout,
     LeapMotion,
-    LeapShape,
     make_layout,
     plan_motion,
 )
@@ -35,17 +34,18 @@ from twirl_mjx.sim import a1
 CONTROL_RATE = 20.0
 """Hz, of the policy (paper, section "Actions")."""
 STAGES = (
-    (3.0, 1e-3, 60),
-    (10.0, 1e-2, 40),
-    (30.0, 3e-2, 30),
-    (100.0, 0.1, 30),
-    (100.0, 0.3, 30),
-    (100.0, 1.0, 30),
-    (300.0, 100.0, 60),
-    (1000.0, 1000.0, 40),
+    (3.0, 1e-3, 3.0, 60),
+    (10.0, 1e-2, 3.0, 40),
+    (30.0, 3e-2, 3.0, 30),
+    (100.0, 0.1, 3.0, 30),
+    (100.0, 0.3, 3.0, 30),
+    (100.0, 1.0, 3.0, 30),
+    (100.0, 3.0, 3.0, 30),
+    (100.0, 3.0, 30.0, 60),
+    (1000.0, 1000.0, 30.0, 40),
 )
-"""Weight of closing the cycle, weight of the fictitious torque, Gauss-Newton steps."""
-WARM_STAGE = 2
+"""Weights of closing the cycle, of the fictitious torque and of friction; Gauss-Newton steps."""
+WARM_STAGE = 6
 """Index of the first stage when the solver goes on from a given plan."""
 LEG_LENGTHS = (0.115, 0.345)
 """m, wished range of hip-to-foot lengths, inside the joint limits' [0.088, 0.359]."""
@@ -53,23 +53,6 @@ CLOSURE_TOLERANCE = 1e-3
 """Largest cycle error (m, m/s, rad, rad/s) of an accepted solution."""
 JOINT_ORDER = ("front thigh", "hind thigh", "front calf", "hind calf")
 """Rows of ``JointMotion``."""
-
-
-class LeapWishes(LeapShape, Protocol):
-    """Settings of a leap the solver reads (see ``leap.LeapConfig``)."""
-
-    @property
-    def band_length(self) -> float: ...  # noqa: D102
-    @property
-    def foot_clearance(self) -> float: ...  # noqa: D102
-    @property
-    def run_up_foot_height(self) -> float: ...  # noqa: D102
-    @property
-    def max_pitch(self) -> float: ...  # noqa: D102
-    @property
-    def friction(self) -> float: ...  # noqa: D102
-    @property
-    def torque_share(self) -> float: ...  # noqa: D102
 
 
 @dataclass(frozen=True)
@@ -97,7 +80,7 @@ def periodic_derivatives(
     return (ahead - behind) / (2 * dt), (ahead - 2 * values + behind) / dt**2
 
 
-def joint_motion(config: LeapShape, model: PlanarModel, motion: LeapMotion) -> JointMotion:
+def joint_motion(config: LeapConfig, model: PlanarModel, motion: LeapMotion) -> JointMotion:
     """Return joint angles, their derivatives, torques by inverse dynamics, and PD targets."""
     dt, states = motion.dt, motion.states
     gains = (config.cycle_length, 0.0)
@@ -146,7 +129,7 @@ def filter_gains(count: int, duration: float) -> tuple[np.ndarray, np.ndarray]:
     return inverse, magnitude * inverse
 
 
-def closure(config: LeapShape, motion: LeapMotion) -> np.ndarray:
+def closure(config: LeapConfig, motion: LeapMotion) -> np.ndarray:
     """Return how far the cycle is from closing [..., 6]: x, z (m), v (m/s), pitch, its rate."""
     com, velocity = (x[..., -1, :] - x[..., 0, :] for x in (motion.com, motion.com_vel))
     turn = motion.pose.pitch[..., -1] - motion.pose.pitch[..., 0]
@@ -177,7 +160,7 @@ def _per_joint(thigh: float, calf: float) -> np.ndarray:
 
 
 def joint_residuals(
-    config: LeapWishes, joints: JointMotion, gains: tuple[np.ndarray, np.ndarray]
+    config: LeapConfig, joints: JointMotion, gains: tuple[np.ndarray, np.ndarray]
 ) -> dict[str, np.ndarray]:
     """Return the residual blocks [..., *] about joints, torques and the controller."""
     angle, velocity, accel, torque, target = (
@@ -207,7 +190,7 @@ def joint_residuals(
     }
 
 
-def body_residuals(config: LeapWishes, mass: float, motion: LeapMotion) -> dict[str, np.ndarray]:
+def body_residuals(config: LeapConfig, mass: float, motion: LeapMotion) -> dict[str, np.ndarray]:
     """Return the residual blocks [..., *] about legs, feet, pitch and friction."""
     feet, knees = motion.feet[..., :-1, :, :], motion.states.knee[..., :-1, :, 1]
     bottom = feet[..., 1] - a1.FOOT_RADIUS
@@ -219,8 +202,7 @@ def body_residuals(config: LeapWishes, mass: float, motion: LeapMotion) -> dict[
         "knee height": 20.0 * _above(0.07, knees),
         "pitch": 5.0 * _above(np.abs(motion.pose.pitch[..., :-1]), config.max_pitch),
         "feet apart": 10.0 * _above(0.12, feet[..., 0, 0] - feet[..., 1, 0]),
-        "friction": 30.0
-        * _above(
+        "friction": _above(
             np.abs(motion.force[..., :-1, :, 0]), config.friction * motion.force[..., :-1, :, 1]
         )
         / weight,
@@ -233,11 +215,11 @@ def body_residuals(config: LeapWishes, mass: float, motion: LeapMotion) -> dict[
 
 
 def residuals(
-    config: LeapWishes,
+    config: LeapConfig,
     layout: Layout,
     model: PlanarModel,
     params: np.ndarray,
-    weights: tuple[float, float],
+    weights: tuple[float, float, float],
     guess: LeapMotion | None = None,
 ) -> dict[str, np.ndarray]:
     """Return all residual blocks [..., *] of plans ``params`` [..., P].
@@ -247,7 +229,7 @@ def residuals(
         layout: Meaning of ``params``.
         model: Masses.
         params: [..., P].
-        weights: Of closing the cycle, and of the fictitious pitch torque.
+        weights: Of closing the cycle, of the fictitious pitch torque and of friction.
         guess: Motion of a very near plan.
     """
     motion = plan_motion(config, layout, model, params, guess)
@@ -256,6 +238,7 @@ def residuals(
     scale = 1.0 / np.sqrt(config.num_frames)
     blocks = joint_residuals(config, joint_motion(config, model, motion), gains)
     blocks |= body_residuals(config, model.mass, motion)
+    blocks["friction"] = weights[2] * blocks["friction"]
     out = {name: scale * block.reshape(*lead, -1) for name, block in blocks.items()}
     # Ends count in the units of ``closure``, velocities a third.
     out["closure"] = weights[0] * closure(config, motion) * np.array([1, 1, 0.3, 0.3, 1, 0.3])
@@ -270,7 +253,7 @@ def residuals(
     return out
 
 
-def first_guess(config: LeapShape, layout: Layout, model: PlanarModel) -> np.ndarray:
+def first_guess(config: LeapConfig, layout: Layout, model: PlanarModel) -> np.ndarray:
     """Return parameters [P] whose fictitious torque keeps the trunk level."""
     params = layout.start.copy()
     motion = plan_motion(config, layout, model, params)
@@ -281,7 +264,7 @@ def first_guess(config: LeapShape, layout: Layout, model: PlanarModel) -> np.nda
 
 
 def solve_leap(
-    config: LeapWishes,
+    config: LeapConfig,
     model: PlanarModel,
     progress: Callable[[str], None] | None = None,
     start: np.ndarray | None = None,
@@ -300,12 +283,12 @@ def solve_leap(
     layout = make_layout(config)
     params = first_guess(config, layout, model) if start is None else start
     stages = STAGES if start is None else STAGES[WARM_STAGE:]
-    for number, (close, slack, steps) in enumerate(stages, 1):
+    for number, (close, slack, friction, steps) in enumerate(stages, 1):
 
         def stacked(
             values: np.ndarray,
             guess: LeapMotion | None = None,
-            weights: tuple[float, float] = (close, slack),
+            weights: tuple[float, float, float] = (close, slack, friction),
         ) -> np.ndarray:
             blocks = residuals(config, layout, model, values, weights, guess)
             return np.concatenate(list(blocks.values()), axis=-1)

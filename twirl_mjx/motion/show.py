@@ -1,18 +1,17 @@
-"""Figures and pictures of clips: what a motion does, next to others, and the robot doing it."""
+"""Figures of clips: what a motion does, and how it compares with others.
+
+Pictures of the robot in the poses of a clip: ``deploy.render`` with ``clip.configurations``.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
 
-import imageio.v3 as iio
-import jax
-import jax.numpy as jnp
 import matplotlib.figure
-import mujoco
 import numpy as np
 
-from twirl_mjx.motion.clip import Clip, headings, sample
+from twirl_mjx.motion.clip import Clip, headings
 from twirl_mjx.motion.formats import foot_paths
 from twirl_mjx.sim import a1
 
@@ -122,107 +121,3 @@ def compare(clips: Sequence[Clip], path: str | Path, source: str = "") -> None:
     for axis in axes:
         axis.spines[["top", "right"]].set_visible(False)
     figure.savefig(path, dpi=150)
-
-
-def _scene(bands: Sequence[float]) -> mujoco.MjModel:
-    """Return the robot on a floor with drawn hurdle bands at x in m."""
-    spec = mujoco.MjSpec.from_file(str(a1.xml_path()))
-    spec.add_texture(
-        name="floor",
-        type=mujoco.mjtTexture.mjTEXTURE_2D,
-        width=256,
-        height=256,
-        builtin=mujoco.mjtBuiltin.mjBUILTIN_CHECKER,
-        rgb1=[0.82, 0.84, 0.86],
-        rgb2=[0.74, 0.77, 0.80],
-    )
-    material = spec.add_material(name="floor", texrepeat=[2, 2], texuniform=True)
-    material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "floor"
-    spec.add_texture(
-        name="sky",
-        type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
-        width=64,
-        height=64,
-        builtin=mujoco.mjtBuiltin.mjBUILTIN_FLAT,
-        rgb1=[0.95, 0.97, 1.0],
-        rgb2=[0.95, 0.97, 1.0],
-    )
-    world = spec.worldbody
-    world.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 0.05], material="floor")
-    world.add_light(
-        pos=[0, -1, 4],
-        dir=[0.2, 0.3, -1],
-        type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
-        diffuse=[0.7, 0.7, 0.7],
-    )
-    for x in bands:
-        world.add_geom(
-            type=mujoco.mjtGeom.mjGEOM_BOX,
-            size=[0.1, 0.8, 0.005],
-            pos=[x, 0, 0.005],
-            rgba=[0.90, 0.33, 0.12, 1],
-        )
-    spec.visual.headlight.ambient = [0.4, 0.4, 0.4]
-    spec.visual.global_.offwidth, spec.visual.global_.offheight = 1280, 960
-    return spec.compile()
-
-
-def render(
-    clip: Clip,
-    times: np.ndarray,
-    *,
-    size: tuple[int, int] = (480, 320),
-    bands: Sequence[float] = (),
-) -> np.ndarray:
-    """Render the A1 in the poses of a clip, seen from its right side.
-
-    Needs an OpenGL context: without a display set ``MUJOCO_GL`` to ``egl`` or ``osmesa``.
-
-    Args:
-        clip: The motion.
-        times: [T] s, any sign for a wrapping clip.
-        size: Width and height in pixels.
-        bands: x in m of hurdle bands to draw.
-
-    Returns:
-        [T, height, width, 3] uint8.
-    """
-    model = _scene(bands)
-    data = mujoco.MjData(model)
-    camera = mujoco.MjvCamera()
-    camera.azimuth, camera.elevation, camera.distance = 80.0, -10.0, 1.25
-    images = []
-    with mujoco.Renderer(model, size[1], size[0]) as renderer:
-        for qpos in poses(clip, times):
-            data.qpos[:] = qpos
-            mujoco.mj_kinematics(model, data)
-            mujoco.mj_comPos(model, data)
-            camera.lookat[:] = qpos[0], qpos[1], 0.28
-            renderer.update_scene(data, camera)
-            images.append(renderer.render())
-    return np.array(images)
-
-
-def poses(clip: Clip, times: np.ndarray) -> np.ndarray:
-    """Return the clip's configurations [T, 19] at ``times`` [T] s, one cycle after another."""
-    qpos, _ = jax.vmap(sample, in_axes=(None, 0))(clip.to_arrays(), jnp.asarray(times, jnp.float32))
-    return np.asarray(qpos)
-
-
-def render_strip(
-    clip: Clip, path: str | Path, *, count: int = 10, columns: int = 5, bands: Sequence[float] = ()
-) -> None:
-    """Write a PNG of ``count`` poses of one cycle, in rows of ``columns``."""
-    times = np.arange(count) * clip.cycle_duration / count
-    images = render(clip, times, size=(360, 260), bands=bands)
-    blank = np.full_like(images[:1], 255).repeat(-count % columns, axis=0)
-    rows = np.concatenate([images, blank]).reshape(-1, columns, *images.shape[1:])
-    iio.imwrite(path, np.concatenate([np.concatenate(list(row), axis=1) for row in rows]))
-
-
-def render_video(
-    clip: Clip, path: str | Path, *, cycles: int = 3, fps: int = 40, bands: Sequence[float] = ()
-) -> None:
-    """Write an MP4 of some cycles."""
-    times = np.arange(int(cycles * clip.cycle_duration * fps)) / fps
-    iio.imwrite(path, render(clip, times, size=(640, 400), bands=bands), fps=fps)

@@ -1,0 +1,71 @@
+"""How far a clip can be followed without feedback: the control pipeline in C MuJoCo.
+
+The feed-forward actions of ``leap_checks.feed_forward`` go through the very pipeline a policy has:
+20 Hz, Butterworth low-pass, joint limits, PD motors with their torque limit, contacts. A bounding
+robot is unstable, so without feedback it leaves the motion within a cycle or so; but a clip whose
+first take-off and flight already fail here asks for something the motors do not give.
+"""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+from scipy import signal
+
+from twirl_mjx.motion.clip import Clip, frame_velocities
+from twirl_mjx.motion.leap_checks import CONTROL_RATE, feed_forward, inverse_dynamics
+from twirl_mjx.sim import a1
+
+
+def robot_on_floor() -> mujoco.MjModel:
+    """Return the robot on a plane with friction 1, stepped at 5 ms."""
+    spec = mujoco.MjSpec.from_file(str(a1.xml_path()))
+    spec.worldbody.add_geom(
+        name="floor",
+        type=mujoco.mjtGeom.mjGEOM_PLANE,
+        size=[0, 0, 0.05],
+        contype=1,
+        conaffinity=0,
+        priority=1,
+        friction=[1.0, 0.005, 0.0001],
+    )
+    return spec.compile()
+
+
+def clip_state(clip: Clip, time: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return qpos [19] and qvel [18] at the frame nearest to ``time`` s of a wrapping clip."""
+    frame = round(time / clip.frame_duration)
+    cycle, frame = divmod(frame, clip.num_frames - 1)
+    qpos = clip.qpos[frame].copy()
+    qpos[:2] += cycle * clip.cycle_displacement[:2]
+    return qpos, np.concatenate(frame_velocities(clip), axis=1)[frame]
+
+
+def open_loop(clip: Clip, start: float, duration: float) -> tuple[np.ndarray, np.ndarray]:
+    """Play the feed-forward actions from a state of the clip.
+
+    Args:
+        clip: A wrapping clip that does not turn.
+        start: s, time in the clip; rounded to a control step.
+        duration: s.
+
+    Returns:
+        Simulated and reference configurations at the ends of the control steps, [K, 19] each.
+    """
+    actions, _, _ = feed_forward(clip, inverse_dynamics(clip))
+    cycle, targets = len(actions), a1.DEFAULT_POSE + actions * a1.ACTION_HALF_RANGE
+    numerator, denominator = signal.butter(2, 0.4)
+    settled = signal.lfilter(numerator, denominator, np.tile(targets, (8, 1)), axis=0)[-cycle:]
+    model = robot_on_floor()
+    data = mujoco.MjData(model)
+    first = round(start * CONTROL_RATE)
+    step = clip.cycle_duration / cycle
+    data.qpos[:], data.qvel[:] = clip_state(clip, first * step)
+    simulated, reference = [], []
+    for now in range(first, first + round(duration * CONTROL_RATE)):
+        limits = a1.JOINT_LIMITS
+        data.ctrl[:] = np.clip(settled[now % cycle], limits[:, 0], limits[:, 1])
+        mujoco.mj_step(model, data, nstep=round(step / model.opt.timestep))
+        simulated.append(data.qpos.copy())
+        reference.append(clip_state(clip, (now + 1) * step)[0])
+    return np.array(simulated), np.array(reference)
