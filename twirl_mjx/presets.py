@@ -42,7 +42,11 @@ def _cpu(task: str) -> TrainConfig:
         epoch_env_steps=3200,
         env=EnvConfig(num_envs=64, train_episode_length=100 if task == "stand" else None),
         droq=DroqConfig(
-            hidden_sizes=(128, 128), utd=0.5, updates_per_block=8, initial_temperature=0.1
+            hidden_sizes=(128, 128),
+            utd=0.5,
+            updates_per_block=8,
+            initial_temperature=0.1,
+            discount=0.97 if task == "stand" else 0.99,
         ),
         eval=EvalConfig(every=96_000, episodes=32),
         stand=StandConfig(height_of="front_feet", risen_fraction=0.9),

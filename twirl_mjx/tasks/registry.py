@@ -38,6 +38,7 @@ def make_task(config: TrainConfig) -> Task:
 def make_env(
     config: TrainConfig,
     *,
+    training: bool = False,
     num_envs: int | None = None,
     scene_kind: SceneKind | None = None,
     threads: int | None = None,
@@ -46,10 +47,18 @@ def make_env(
 
     Args:
         config: Task, shift and options.
+        training: Start and cut episodes as configured for training (``stand.risen_fraction``,
+            ``env.train_episode_length``), else as the task says.
         num_envs: Worlds, ``config.env.num_envs`` by default.
         scene_kind: Ground, that of the config's shift by default.
         threads: Host threads of the native engine, all by default.
     """
+    if not training:
+        config = dataclasses.replace(
+            config,
+            stand=dataclasses.replace(config.stand, risen_fraction=0.0),
+            env=dataclasses.replace(config.env, train_episode_length=None),
+        )
     task = make_task(config)
     scene = build_scene(
         scene_kind or get_shift(config.shift).scene, collision=task.collision, options=SimOptions()
@@ -93,5 +102,6 @@ def make(
     return make_env(
         dataclasses.replace(
             base, task=task, shift=shift, shift_strength=shift_strength, env=env, droq=droq
-        )
+        ),
+        training=True,
     )

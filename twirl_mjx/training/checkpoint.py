@@ -39,6 +39,22 @@ def _flatten(tree: Any) -> dict[str, np.ndarray]:
     }
 
 
+def _abstract(tree: Any) -> dict[str, jax.ShapeDtypeStruct]:
+    """Return shapes and dtypes of what :func:`_flatten` gives, without any array."""
+
+    def words(leaf: Any) -> Any:
+        return jax.random.key_data(leaf) if _is_key(leaf) else leaf
+
+    leaves = jax.tree_util.tree_flatten_with_path(
+        jax.eval_shape(lambda t: jax.tree.map(words, t), tree)
+    )[0]
+    return {
+        jax.tree_util.keystr(path, simple=True, separator="."): leaf
+        for path, leaf in leaves
+        if leaf.size
+    }
+
+
 def _unflatten(template: Any, values: dict[str, np.ndarray]) -> Any:
     """Return ``template`` with its leaves replaced by ``values`` of the same paths."""
     paths, treedef = jax.tree_util.tree_flatten_with_path(template)
@@ -118,14 +134,14 @@ class Checkpoints:
         bare = template.replace(
             replay=template.replay.replace(source=None, online=_bare(template))
         )
-        flat = {k: np.zeros(v.shape, v.dtype) for k, v in _flatten(bare).items()}
+        flat = _abstract(bare)
         found = self._manager.restore(
             step,
             args=ocp.args.Composite(
                 train_state=ocp.args.StandardRestore(flat), progress=ocp.args.JsonRestore()
             ),
         )
-        state = _unflatten(bare, found["train_state"])
+        state = _unflatten(bare, {k: np.asarray(v) for k, v in found["train_state"].items()})
         online = self._read_rows(state, template)
         replay = template.replay.replace(online=online)
         return state.replace(replay=replay), dict(found["progress"])

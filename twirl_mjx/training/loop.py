@@ -83,15 +83,6 @@ def no_memory(env_state: Any) -> tuple[()]:
     return ()
 
 
-def eval_config(config: TrainConfig) -> TrainConfig:
-    """Return the config of evaluation: episodes start and last as the task says."""
-    return dataclasses.replace(
-        config,
-        stand=dataclasses.replace(config.stand, risen_fraction=0.0),
-        env=dataclasses.replace(config.env, train_episode_length=None),
-    )
-
-
 def make_header(
     config: TrainConfig, env: VectorEnv, card: dict[str, Any]
 ) -> PolicyHeader:
@@ -147,12 +138,12 @@ class Run:
         rundir.open_run(run_dir, config)
         self.config = config
         self.run_dir = run_dir
-        self.env = make_env(config)
+        self.env = make_env(config, training=True)
         self.checkpoints = Checkpoints(run_dir)
         self.stage = stage
         self.source = source
         self.progress: dict[str, Any] = {"best": -math.inf, "wall_s": 0.0, "inserted": 0}
-        env = make_env(eval_config(config), num_envs=config.eval.episodes)
+        env = make_env(config, num_envs=config.eval.episodes)
         self._evaluate = make_evaluate(env, no_memory, act_mean)
         self._epoch = state.compile_epoch(config, self.env)
 
@@ -172,10 +163,7 @@ class Run:
             if initial is not None:
                 made = made.replace(learner=initial(made.learner))
         else:
-            template = jax.tree.map(
-                lambda x: x if hasattr(x, "dtype") else jnp.asarray(x), jax.eval_shape(fresh, key)
-            )
-            made, progress = self.checkpoints.restore(template)
+            made, progress = self.checkpoints.restore(jax.eval_shape(fresh, key))
             self.progress |= progress
         return made.replace(replay=made.replay.replace(source=self.source))
 
@@ -233,7 +221,8 @@ class Run:
             if now // config.eval.every > steps // config.eval.every or (
                 now >= config.total_env_steps
             ):
-                values |= self.evaluate(train_state)
+                with logger.aside("evaluating ..."):
+                    values |= self.evaluate(train_state)
             logger.log(now, int(train_state.learner.grad_steps), values)
             if time.monotonic() - saved > 60.0 * config.checkpoint_minutes:
                 self.save(train_state)
@@ -270,6 +259,9 @@ def train(
     try:
         train_state = run.start(initial)
         steps = int(train_state.env_steps)
+        done = finished_evaluation(run_dir, steps) if steps >= config.total_env_steps else None
+        if done is not None:
+            return Outcome(True, steps, done)
         with (
             stop_on_signal() as stop,
             RunLogger(
@@ -283,7 +275,8 @@ def train(
             if steps < config.total_env_steps:
                 logger.announce(f"stopped at {steps:,} transitions; the same command resumes")
                 return Outcome(False, steps, {})
-            final = final_evaluation(config, run_dir, steps)
+            with logger.aside("final evaluation ..."):
+                final = final_evaluation(config, run_dir, steps)
             logger.log(
                 steps,
                 int(train_state.learner.grad_steps),
@@ -299,12 +292,26 @@ def final_evaluation(config: TrainConfig, run_dir: Path, env_steps: int) -> dict
     from twirl_mjx.policies.learned import load_policy
 
     policy = load_policy(run_dir / "policy.npz")
-    env = make_env(eval_config(config), num_envs=config.eval.final_episodes)
+    env = make_env(config, num_envs=config.eval.final_episodes)
     evaluate = make_evaluate(env, no_memory, act_mean)
     actor = jax.tree.map(jnp.asarray, dict(policy.actor_params))
     values = evaluate(actor, jax.random.key(config.eval.seed + 1))
     write_episodes(run_dir / EVAL_CSV, rundir.identity(run_dir, config), env_steps, values)
     return {name: float(np.mean(v)) for name, v in values.items()}
+
+
+def finished_evaluation(run_dir: Path, env_steps: int) -> dict[str, float] | None:
+    """Return the mean measures in ``eval.csv`` if it closes a run of ``env_steps``, else None."""
+    path = run_dir / EVAL_CSV
+    if not path.is_file():
+        return None
+    values: dict[str, list[float]] = {}
+    with path.open(newline="") as file:
+        for row in csv.DictReader(file):
+            if int(row["env_steps"]) != env_steps:
+                return None
+            values.setdefault(row["metric"], []).append(float(row["value"]))
+    return {name: float(np.mean(column)) for name, column in values.items()}
 
 
 def write_episodes(

@@ -279,7 +279,7 @@ def zero_shot(config: TrainConfig, run_dir: Path, source: Source, say: Say) -> P
     from twirl_mjx.evaluation.rollout import make_evaluate
 
     rundir.open_run(run_dir, config)
-    env = make_env(loop.eval_config(config), num_envs=config.eval.final_episodes)
+    env = make_env(config, num_envs=config.eval.final_episodes)
 
     def act(params: Any, memory: Any, state: Any, key: jax.Array) -> tuple[jax.Array, Any]:
         return source.policy.act(memory, state, key)

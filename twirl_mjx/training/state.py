@@ -67,23 +67,13 @@ def init(
         env=env.reset(env_key),
         replay=MixedReplay(
             source=source,
-            online=ring.init(
-                min(config.replay.capacity, _rounded_total(config)),
-                env.observation_size,
-                env.action_size,
-            ),
+            online=ring.init(config.replay.capacity, env.observation_size, env.action_size),
         ),
         tracker=measures.tracker_init(config.task, env.num_envs),
         key=key,
         env_steps=jnp.zeros((), jnp.int32),
         inserted=jnp.zeros((), jnp.int32),
     )
-
-
-def _rounded_total(config: TrainConfig) -> int:
-    """Transitions the run will gather: whole epochs."""
-    epoch = config.steps_per_epoch * config.env.num_envs
-    return -(-config.total_env_steps // epoch) * epoch
 
 
 def collect_step(

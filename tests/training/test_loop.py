@@ -1,0 +1,210 @@
+"""Training end to end on the debug preset: counters, compilation, resume, guards, refusals."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import json
+import threading
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from twirl_mjx.config import TrainConfig
+from twirl_mjx.droq import learner as droq
+from twirl_mjx.policies.learned import load_policy
+from twirl_mjx.replay import ring
+from twirl_mjx.training import loop, rundir, state
+from twirl_mjx.training.checkpoint import Checkpoints, load_learner, load_replay
+from twirl_mjx.training.state import TrainState
+
+
+def read_rows(path: Path) -> list[dict[str, str]]:
+    """Return the rows of a tidy table."""
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def final_state(config: TrainConfig, run_dir: Path) -> TrainState:
+    """Return the state stored by a finished run."""
+    run = loop.Run(config, run_dir, None, "test")
+    try:
+        return run.start(None)
+    finally:
+        run.close()
+
+
+@pytest.fixture(scope="module")
+def whole_run(stand_config: TrainConfig, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    run_dir = tmp_path_factory.mktemp("runs") / "whole"
+    outcome = loop.train(stand_config, run_dir)
+    assert outcome.finished
+    assert outcome.env_steps == 96
+    return run_dir
+
+
+def assert_identical(a: TrainState, b: TrainState) -> None:
+    """Assert that two states agree bit for bit."""
+    for (path, x), y in zip(
+        jax.tree_util.tree_flatten_with_path(a)[0], jax.tree.leaves(b), strict=True
+    ):
+        if jnp.issubdtype(x.dtype, jax.dtypes.prng_key):
+            x, y = jax.random.key_data(x), jax.random.key_data(y)
+        np.testing.assert_array_equal(np.asarray(x), np.asarray(y), err_msg=str(path))
+
+
+def test_resumed_run_equals_whole_run_bit_for_bit(
+    stand_config: TrainConfig, short_stand_config: TrainConfig, whole_run: Path, tmp_path: Path
+) -> None:
+    run_dir = tmp_path / "parts"
+    assert loop.train(short_stand_config, run_dir).env_steps == 64
+    assert loop.train(stand_config, run_dir).env_steps == 96
+    a = final_state(stand_config, whole_run)
+    b = final_state(stand_config, run_dir)
+    assert int(a.learner.grad_steps) == 64
+    assert_identical(a, b)
+
+
+def test_run_directory_is_complete(stand_config: TrainConfig, whole_run: Path) -> None:
+    for name in ("config.json", "versions.json", "metrics.csv", "eval.csv", "policy.npz"):
+        assert (whole_run / name).is_file(), name
+    assert rundir.read_config(whole_run) == stand_config
+    assert json.loads((whole_run / "versions.json").read_text())["jax"] == jax.__version__
+    rows = read_rows(whole_run / "metrics.csv")
+    assert {row["env_steps"] for row in rows} == {"32", "64", "96"}
+    names = {row["metric"] for row in rows}
+    assert {"return", "critic_loss", "temperature", "eval/return", "eval/standing_time"} <= names
+    episodes = read_rows(whole_run / "eval.csv")
+    assert len({row["episode"] for row in episodes}) == stand_config.eval.final_episodes
+
+
+def test_update_counter_follows_utd(stand_config: TrainConfig, whole_run: Path) -> None:
+    final = final_state(stand_config, whole_run)
+    trained_on = int(final.env_steps) - stand_config.warmup_env_steps
+    assert int(final.learner.grad_steps) == stand_config.droq.utd * trained_on
+    assert int(final.inserted) == 96
+    assert int(final.replay.online.size) == 96
+
+
+def test_policy_file_acts_like_the_stored_actor(
+    stand_config: TrainConfig, whole_run: Path
+) -> None:
+    final = final_state(stand_config, whole_run)
+    policy = load_policy(whole_run / "policy_last.npz")
+    obs = np.random.default_rng(0).normal(size=(5, 101)).astype(np.float32)
+    expected = droq.mean_action(final.learner.actor, jnp.asarray(obs))
+    np.testing.assert_allclose(policy.act(obs), np.asarray(expected), atol=1e-6)
+
+
+def test_stored_experience_and_networks_can_be_read_alone(
+    stand_config: TrainConfig, whole_run: Path
+) -> None:
+    final = final_state(stand_config, whole_run)
+    rows = load_replay(whole_run)
+    np.testing.assert_array_equal(rows, np.asarray(final.replay.online.rows)[:96])
+    stored = load_learner(whole_run)
+    jax.tree.map(np.testing.assert_array_equal, stored["critic"], final.learner.critic)
+
+
+def test_finished_run_is_left_alone(stand_config: TrainConfig, whole_run: Path) -> None:
+    before = (whole_run / "metrics.csv").read_bytes()
+    assert loop.train(stand_config, whole_run).finished
+    assert (whole_run / "metrics.csv").read_bytes() == before
+
+
+def test_other_config_is_refused_with_a_diff(stand_config: TrainConfig, whole_run: Path) -> None:
+    other = dataclasses.replace(
+        stand_config, droq=dataclasses.replace(stand_config.droq, discount=0.9)
+    )
+    before = (whole_run / "config.json").read_bytes()
+    with pytest.raises(rundir.RunMismatchError, match=r"droq\.discount: 0\.99 -> 0\.9"):
+        loop.train(other, whole_run)
+    assert (whole_run / "config.json").read_bytes() == before
+
+
+def test_stop_event_saves_and_ends_the_loop(
+    stand_config: TrainConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    event = threading.Event()
+    original = loop.Run.evaluate
+
+    def stop_after_evaluation(run: loop.Run, train_state: TrainState) -> dict[str, float]:
+        event.set()
+        return original(run, train_state)
+
+    class AlwaysThisEvent:
+        def __enter__(self) -> threading.Event:
+            return event
+
+        def __exit__(self, *_: object) -> None:
+            return None
+
+    monkeypatch.setattr(loop, "stop_on_signal", AlwaysThisEvent)
+    monkeypatch.setattr(loop.Run, "evaluate", stop_after_evaluation)
+    outcome = loop.train(stand_config, tmp_path / "stopped")
+    assert not outcome.finished
+    assert outcome.env_steps == 64
+    checkpoints = Checkpoints(tmp_path / "stopped")
+    assert checkpoints.latest() == 64
+    checkpoints.close()
+
+
+def test_epoch_is_traced_once_and_donates(stand_config: TrainConfig) -> None:
+    env = loop.make_env(stand_config, training=True)
+    traces = 0
+    observe = env.task.observer.observe
+
+    def counted(*args: object) -> jax.Array:
+        nonlocal traces
+        traces += 1
+        return observe(*args)
+
+    env.task.observer.observe = counted
+    epoch = state.compile_epoch(stand_config, env)
+    train_state = jax.jit(lambda k: state.init(stand_config, env, k, None))(jax.random.key(0))
+    after_init = traces
+    first = train_state
+    train_state, _ = epoch(train_state)
+    after_first = traces
+    train_state, _ = epoch(train_state)
+    train_state, metrics = epoch(train_state)
+    assert after_first > after_init
+    assert traces == after_first, "the second epoch compiled again"
+    assert first.replay.online.rows.is_deleted()
+    assert np.isfinite(float(metrics["critic_loss"]))
+
+
+def test_diverged_learner_names_the_tensor(stand_config: TrainConfig, whole_run: Path) -> None:
+    learner = final_state(stand_config, whole_run).learner
+    kernel = learner.actor["mean"]["kernel"].at[0, 0].set(jnp.nan)
+    broken = learner.replace(
+        actor=learner.actor | {"mean": learner.actor["mean"] | {"kernel": kernel}}
+    )
+    loop.check_finite(learner)
+    with pytest.raises(loop.DivergedError, match=r"actor\.mean\.kernel"):
+        loop.check_finite(broken)
+
+
+def test_source_data_are_required(stand_config: TrainConfig, tmp_path: Path) -> None:
+    config = dataclasses.replace(stand_config, task="biped", variant="twirl")
+    with pytest.raises(ValueError, match="needs source data"):
+        loop.train(config, tmp_path / "x")
+    assert not (tmp_path / "x").exists()
+
+
+def test_non_finite_world_never_reaches_the_ring(stand_config: TrainConfig) -> None:
+    env = loop.make_env(stand_config, training=True)
+    train_state = state.init(stand_config, env, jax.random.key(0), None)
+    data = train_state.env.data
+    poisoned = data.replace(qvel=data.qvel.at[1, 0].set(jnp.nan))
+    train_state = train_state.replace(env=train_state.env.replace(data=poisoned))
+    after, result = state.collect_step(stand_config, env, train_state, jax.random.key(1))
+    assert np.asarray(result.invalid).tolist() == [False, True, False, False]
+    assert int(after.inserted) == 3
+    assert int(after.replay.online.size) == 3
+    rows = ring.gather(after.replay.online, jnp.arange(4))
+    assert np.isfinite(np.asarray(rows.next_obs)).all()
+    assert np.isfinite(np.asarray(result.obs)).all()

@@ -1,0 +1,75 @@
+"""``twirl clip make`` and ``twirl clip show``."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from twirl_mjx.assets import asset_path
+from twirl_mjx.commands.options import parse, say
+from twirl_mjx.config import check_choice
+from twirl_mjx.motion import show as show_lib
+from twirl_mjx.motion.formats import read_clip, write_clip
+from twirl_mjx.motion.leap import make_leap
+from twirl_mjx.motion.leap_checks import require_leap
+from twirl_mjx.motion.leap_config import LeapConfig
+
+
+@dataclasses.dataclass(frozen=True)
+class MakeOptions:
+    """Plan our leap, check it and write it as a clip."""
+
+    out: Path = Path("leap.json")
+    """Clip file to write."""
+    leap: LeapConfig = LeapConfig()
+    """What the leap shall be like."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ShowOptions:
+    """Draw and render a clip; with several, compare them (the first is drawn as ours)."""
+
+    clips: Annotated[tuple[Path, ...], tyro.conf.Positional] = ()
+    """Clip files; the shipped leap by default."""
+    out: Path = Path("runs/clip")
+    """Pictures are <out>.png, <out>-strip.png and, for several clips, <out>-compare.png."""
+    source: str = ""
+    """Where the other clips come from, written into the comparison."""
+
+
+def main(argv: list[str]) -> int:
+    """Run ``make`` or ``show``."""
+    verb, rest = (argv[0], argv[1:]) if argv else ("", [])
+    if verb in ("-h", "--help", ""):
+        say("usage: twirl clip {make,show} [options]; `twirl clip make --help` lists them")
+        return 0 if verb else 2
+    check_choice("clip action", verb, ("make", "show"))
+    return _make(rest) if verb == "make" else _show(rest)
+
+
+def _make(argv: list[str]) -> int:
+    options = parse(MakeOptions, argv, "twirl clip make")
+    clip = make_leap(options.leap, say)
+    for finding in require_leap(clip):
+        say(str(finding))
+    write_clip(clip, options.out)
+    say(f"wrote {options.out}")
+    return 0
+
+
+def _show(argv: list[str]) -> int:
+    options = parse(ShowOptions, argv, "twirl clip show")
+    clips = [read_clip(path) for path in options.clips or (asset_path("a1", "leap.json"),)]
+    options.out.parent.mkdir(parents=True, exist_ok=True)
+    stem = options.out.parent / options.out.name
+    show_lib.show(clips[0], f"{stem}.png")
+    show_lib.render_strip(clips[0], f"{stem}-strip.png")
+    written = [f"{stem}.png", f"{stem}-strip.png"]
+    if len(clips) > 1:
+        show_lib.compare(clips, f"{stem}-compare.png", options.source)
+        written.append(f"{stem}-compare.png")
+    say(f"wrote {', '.join(written)}")
+    return 0
