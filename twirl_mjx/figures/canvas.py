@@ -22,7 +22,7 @@ from twirl_mjx.figures.style import Theme, rc_params, short_count, theme_of
 from twirl_mjx.figures.tables import Table, note_texts
 
 _TITLE, _LEGEND_ROW, _CAPTION_LINE, _PAD = 0.27, 0.21, 0.15, 0.06  # inches
-_CHARACTERS_PER_INCH = 16.5  # of a caption
+_CHARACTERS_PER_INCH = 17.5  # of a caption
 _LEGEND_CHARACTERS_PER_INCH = 13.0
 
 

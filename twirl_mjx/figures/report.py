@@ -226,7 +226,9 @@ def _main_table(part: Part) -> str:
             cells += [_interval_html(value) if value else missing for value in pair]
         commands = "<br>".join(page.command(c) for c in _commands(part.grid, s))
         lines.append([*cells, f'<div class="commands">{commands}</div>'])
-    against = ", ".join(f"{k} {v}" for k, v in baseline.items())
+    against = ", ".join(
+        f"{k} {v:g}" if isinstance(v, float) else f"{k} {v}" for k, v in baseline.items()
+    )
     caption = f"{metric_label(part.main)}. Bold: best of its task and shift."
     caption += f" Ratio and P(better) against {against}." if against else ""
     return page.table(caption, header, lines, numeric=range(2, len(header) - 1))
