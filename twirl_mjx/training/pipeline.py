@@ -66,6 +66,7 @@ def run(config: TrainConfig, preset: str, runs_dir: Path, name: str | None, say:
     Raises:
         StoppedError: A signal stopped a stage after saving it.
         ValueError: The variant does not fit the task, or the source does not fit the variant.
+        RunBusyError: Another process works in the run directory.
     """
     run_dir = runs_dir / (name or rundir.default_name(config, preset))
     if config.task not in SOURCE_OF and config.shift == "none" and config.variant != "scratch":
@@ -73,6 +74,12 @@ def run(config: TrainConfig, preset: str, runs_dir: Path, name: str | None, say:
             f"task {config.task} has no source policy, so variant {config.variant!r} does not"
             " apply (nearest: 'scratch')"
         )
+    with rundir.exclusive(run_dir):
+        return _run(config, preset, runs_dir, run_dir, say)
+
+
+def _run(config: TrainConfig, preset: str, runs_dir: Path, run_dir: Path, say: Say) -> Path:
+    """Do the work of :func:`run` while the run directory is held."""
     if config.variant == "scratch":
         return _train(config, run_dir, None, None)
     source = find_source(config, preset, runs_dir, say)
@@ -127,7 +134,8 @@ def find_source(config: TrainConfig, preset: str, runs_dir: Path, say: Say) -> S
     source_config = dataclasses.replace(make_config(source_task, preset), seed=config.seed)
     source_dir = runs_dir / rundir.default_name(source_config, preset)
     say(f"stage 1 of 3: source policy, task {source_task}, in {source_dir}")
-    _train(source_config, source_dir, None, None)
+    with rundir.exclusive(source_dir):
+        _train(source_config, source_dir, None, None)
     return _from_path(config, source_dir)
 
 

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+import fcntl
 import hashlib
 import importlib.metadata
 import json
+import os
 import platform
 import subprocess
+import time
+from collections.abc import Iterator
 from pathlib import Path
 
 from twirl_mjx import config_json
@@ -15,6 +20,7 @@ from twirl_mjx.config import TrainConfig
 
 CONFIG_NAME = "config.json"
 VERSIONS_NAME = "versions.json"
+LOCK_NAME = ".lock"
 PACKAGES = (
     "twirl-mjx", "mujoco", "mujoco-mjx", "jax", "jaxlib", "brax", "flax", "optax",
     "orbax-checkpoint", "numpy",
@@ -25,6 +31,51 @@ MAY_CHANGE = ("total_env_steps", "checkpoint_minutes", "eval.", "env.engine", "s
 
 class RunMismatchError(ValueError):
     """A run directory that belongs to another configuration."""
+
+
+class RunBusyError(RuntimeError):
+    """A run directory that another process is working on."""
+
+
+@contextlib.contextmanager
+def exclusive(run_dir: Path, wait_s: float = 1.0) -> Iterator[None]:
+    """Hold a run directory: nobody else trains in it meanwhile; ends with the process at last.
+
+    Raises:
+        RunBusyError: Another process holds it; the message names that process.
+    """
+    run_dir.mkdir(parents=True, exist_ok=True)
+    with (run_dir / LOCK_NAME).open("a+") as file:
+        deadline = time.monotonic() + wait_s
+        while not _try_lock(file.fileno(), fcntl.LOCK_EX):
+            if time.monotonic() > deadline:
+                raise RunBusyError(
+                    f"{run_dir} is in use by {owner(run_dir) or 'another process'}: wait for it,"
+                    " stop it, or give another --name"
+                )
+            time.sleep(0.1)
+        file.truncate(0)
+        file.write(f"process {os.getpid()} on {platform.node()}")
+        file.flush()
+        yield
+
+
+def owner(run_dir: Path) -> str | None:
+    """Return who holds a run directory, None when nobody does."""
+    path = run_dir / LOCK_NAME
+    if not path.is_file():
+        return None
+    with path.open() as file:
+        return None if _try_lock(file.fileno(), fcntl.LOCK_SH) else file.read() or "a process"
+
+
+def _try_lock(descriptor: int, kind: int) -> bool:
+    """Try to take a lock that the kernel releases when the file is closed or the process ends."""
+    try:
+        fcntl.flock(descriptor, kind | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True
 
 
 def default_name(config: TrainConfig, preset: str) -> str:
