@@ -12,8 +12,7 @@ Metrics = dict[str, jax.Array]
 """Scalar (or one value per world) diagnostics by name."""
 
 
-@flax.struct.dataclass
-class Transition:
+class Transition(flax.struct.PyTreeNode):
     """One step of experience, or any number of them along leading axes.
 
     ``next_obs`` is the observation *before* any auto-reset and ``terminated`` excludes time

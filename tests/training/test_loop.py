@@ -89,9 +89,7 @@ def test_update_counter_follows_utd(stand_config: TrainConfig, whole_run: Path) 
     assert int(final.replay.online.size) == 96
 
 
-def test_policy_file_acts_like_the_stored_actor(
-    stand_config: TrainConfig, whole_run: Path
-) -> None:
+def test_policy_file_acts_like_the_stored_actor(stand_config: TrainConfig, whole_run: Path) -> None:
     final = final_state(stand_config, whole_run)
     policy = load_policy(whole_run / "policy_last.npz")
     obs = np.random.default_rng(0).normal(size=(5, 101)).astype(np.float32)

@@ -24,7 +24,7 @@ class MakeOptions:
 
     out: Path = Path("leap.json")
     """Clip file to write."""
-    leap: LeapConfig = LeapConfig()
+    leap: LeapConfig = dataclasses.field(default_factory=LeapConfig)
     """What the leap shall be like."""
 
 

@@ -80,7 +80,7 @@ def _evaluate_one(name: str, options: EvaluateOptions) -> list[list[object]]:
     wall = time.monotonic() - began
     _print_table(f"{name} in {config.task}", values)
     conditions = len(options.shifts)
-    say(f"{conditions} conditions x {options.episodes} episodes in {wall:.1f} s, compilation included")
+    say(f"{conditions} conditions x {options.episodes} episodes in {wall:.1f} s, with compilation")
     card = getattr(getattr(found.loaded, "header", None), "card", {})
     identity = [path.stem if path.suffix else path.name or name, config.task]
     steps = card.get("env_steps", 0)

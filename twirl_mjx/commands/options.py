@@ -5,14 +5,12 @@ from __future__ import annotations
 import argparse
 import dataclasses
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any
 
 import tyro
 
 from twirl_mjx.config import TrainConfig
 from twirl_mjx.presets import make_config
-
-T = TypeVar("T")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,7 +33,7 @@ def default_preset() -> str:
     return "cpu" if jax.default_backend() == "cpu" else "paper"
 
 
-def parse(kind: type[T], argv: list[str], prog: str, default: T | None = None) -> T:
+def parse[T](kind: type[T], argv: list[str], prog: str, default: T | None = None) -> T:
     """Parse a command's options with tyro; a wrong one is refused with the nearest valid."""
     if default is None:
         return tyro.cli(kind, args=argv, prog=prog)

@@ -25,7 +25,7 @@ class RehearseOptions:
     """Episodes."""
     seed: int = 0
     """Seed of goals, noise and courses."""
-    robot: RehearsalConfig = RehearsalConfig()
+    robot: RehearsalConfig = dataclasses.field(default_factory=RehearsalConfig)
     """The rehearsed robot."""
 
 

@@ -43,7 +43,9 @@ def _matmul_bwd(
 ) -> tuple[jax.Array, jax.Array]:
     kernel, x = saved
     d_kernel = dot_general(d_out, x, (((2,), (2,)), ((0,), (0,))), matmul_dtype)
-    return d_kernel, matmul(transpose(kernel), d_out, matmul_dtype)
+    # Without the barrier XLA may fold a later transposition into the product; on the CPU that is
+    # slow in float32 and not supported in bfloat16.
+    return d_kernel, _materialise(matmul(transpose(kernel), d_out, matmul_dtype))
 
 
 matmul.defvjp(_matmul_fwd, _matmul_bwd)

@@ -17,8 +17,7 @@ import jax.numpy as jnp
 from twirl_mjx.droq.networks import Params
 
 
-@flax.struct.dataclass
-class PackedCritic:
+class PackedCritic(flax.struct.PyTreeNode):
     """Parameters (or gradients, or moments) of E critics; built by ``pack``."""
 
     kernels: tuple[jax.Array, ...]

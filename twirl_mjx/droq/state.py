@@ -19,8 +19,7 @@ AdamState = optax.ScaleByAdamState
 """Adam's count, first and second moments; optax's own type, so checkpoints name it plainly."""
 
 
-@flax.struct.dataclass
-class DroqState:
+class DroqState(flax.struct.PyTreeNode):
     """Everything that learning changes. A leading seed axis on every leaf is allowed."""
 
     actor: Params
@@ -41,8 +40,7 @@ class DroqState:
     """[] int32, critic updates done."""
 
 
-@flax.struct.dataclass
-class CriticState:
+class CriticState(flax.struct.PyTreeNode):
     """The part of ``DroqState`` that a critic step changes."""
 
     critic: Params

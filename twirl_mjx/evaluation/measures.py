@@ -95,8 +95,7 @@ def success(task: str, values: dict[str, jax.Array]) -> jax.Array:
 _EMPTY = {"sum": 0.0, "mean": 0.0, "min": jnp.inf, "max": -jnp.inf}
 
 
-@flax.struct.dataclass
-class Tracker:
+class Tracker(flax.struct.PyTreeNode):
     """Running measures of the present episode of every world."""
 
     values: dict[str, jax.Array]

@@ -24,8 +24,7 @@ QUAT_TOLERANCE = 0.01
 """Largest deviation of a frame's quaternion norm from 1; smaller ones are normalised away."""
 
 
-@flax.struct.dataclass
-class ClipArrays:
+class ClipArrays(flax.struct.PyTreeNode):
     """A clip on the device, with the velocities of its frames (float32)."""
 
     root_pos: jax.Array

@@ -285,7 +285,7 @@ def feed_forward(clip: Clip, dynamics: Dynamics) -> tuple[np.ndarray, np.ndarray
     closed = np.concatenate([ideal, ideal[:1]])
     wanted = np.stack([np.interp(place, grid, column) for column in closed.T], axis=1)
     wanted = wanted.reshape(steps, fine, a1.NUM_JOINTS).mean(axis=1)
-    numerator, denominator = signal.butter(2, 0.4)
+    numerator, denominator = signal.butter(2, 0.4, output="ba")
     delay = np.roll(np.eye(steps), 1, axis=0)
     powers = np.stack([np.eye(steps), delay, delay @ delay])
     lowpass = np.linalg.solve(

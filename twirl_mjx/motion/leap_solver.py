@@ -120,7 +120,7 @@ def filter_gains(count: int, duration: float) -> tuple[np.ndarray, np.ndarray]:
         Gain from PD target to unfiltered target, and from PD target to the part reached.
     """
     frequency = np.fft.rfftfreq(count, duration / count)
-    numerator, denominator = signal.butter(2, 0.4)
+    numerator, denominator = signal.butter(2, 0.4, output="ba")
     angle = 2 * np.pi * np.minimum(frequency / CONTROL_RATE, 0.5)
     _, response = signal.freqz(numerator, denominator, worN=angle)
     magnitude = np.abs(response) * np.sinc(frequency / CONTROL_RATE)
@@ -147,7 +147,7 @@ def closure(config: LeapConfig, motion: LeapMotion) -> np.ndarray:
     )
 
 
-def _above(value: np.ndarray, limit: float | np.ndarray) -> np.ndarray:
+def _above(value: float | np.ndarray, limit: float | np.ndarray) -> np.ndarray:
     return np.maximum(value - limit, 0.0)
 
 

@@ -55,7 +55,9 @@ def show(clip: Clip, path: str | Path) -> None:
     pitch.axhline(0.0, color="0.8", lw=0.8, zorder=0)
     pitch.set_ylabel("nose-up pitch (deg)")
     for leg, (name, color) in enumerate(zip(a1.LEGS, FOOT_COLORS, strict=True)):
-        feet.plot(times, lowest[:, leg], color=color, label=name, ls="-" if leg % 2 else "--")
+        # Right legs are dashed and on top: in a bound they hide the left ones.
+        style = {"ls": "-", "zorder": 2} if leg % 2 else {"ls": (0, (4, 4)), "zorder": 3}
+        feet.plot(times, lowest[:, leg], color=color, label=name, **style)
         standing = lowest[:, leg] < NEAR_GROUND
         phases.fill_between(
             times, 3 - leg - 0.35, 3 - leg + 0.35, where=standing.tolist(), color=color, lw=0
@@ -81,7 +83,7 @@ def show(clip: Clip, path: str | Path) -> None:
     distance = float(np.linalg.norm(clip.cycle_displacement[:2]))
     height.set_title(
         f"{clip.name}: {distance:.2f} m in {clip.cycle_duration:.2f} s, "
-        f"{flight[:-1].sum() * clip.frame_duration:.2f} s airborne",
+        f"{flight[:-1].sum() * clip.frame_duration:.2f} s of it airborne",
         loc="left",
     )
     figure.savefig(path, dpi=150)

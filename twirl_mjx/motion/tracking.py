@@ -54,8 +54,9 @@ def open_loop(clip: Clip, start: float, duration: float) -> tuple[np.ndarray, np
     """
     actions, _, _ = feed_forward(clip, inverse_dynamics(clip))
     cycle, targets = len(actions), a1.DEFAULT_POSE + actions * a1.ACTION_HALF_RANGE
-    numerator, denominator = signal.butter(2, 0.4)
-    settled = signal.lfilter(numerator, denominator, np.tile(targets, (8, 1)), axis=0)[-cycle:]
+    numerator, denominator = signal.butter(2, 0.4, output="ba")
+    repeated = np.tile(targets, (8, 1))
+    settled = np.asarray(signal.lfilter(numerator, denominator, repeated, axis=0))[-cycle:]
     model = robot_on_floor()
     data = mujoco.MjData(model)
     first = round(start * CONTROL_RATE)

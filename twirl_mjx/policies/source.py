@@ -12,8 +12,7 @@ from twirl_mjx.droq import learner as droq
 from twirl_mjx.tasks.observations import Observer
 
 
-@flax.struct.dataclass
-class LearnedMemory:
+class LearnedMemory(flax.struct.PyTreeNode):
     """Memory of a learned source policy in a foreign task."""
 
     observer: Any

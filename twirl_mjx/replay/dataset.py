@@ -5,13 +5,16 @@ from __future__ import annotations
 import dataclasses
 import json
 from pathlib import Path
+from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 
 from twirl_mjx.types import Transition
 
 FORMAT = "twirl-source-dataset"
 VERSION = 1
+FIELDS = ("obs", "action", "reward", "terminated", "next_obs")
 
 
 class DatasetError(ValueError):
@@ -53,9 +56,9 @@ def write(path: Path, header: DatasetHeader, data: Transition) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(path.name + ".partial")
     text = json.dumps(dataclasses.asdict(header), sort_keys=True)
-    arrays = {f.name: np.asarray(getattr(data, f.name)) for f in dataclasses.fields(data)}
+    arrays: dict[str, Any] = {name: np.asarray(getattr(data, name)) for name in FIELDS}
     with partial.open("wb") as file:
-        np.savez(file, header=np.array(text), **arrays)
+        np.savez(file, allow_pickle=False, header=np.array(text), **arrays)
     partial.replace(path)
 
 
@@ -94,7 +97,7 @@ def read(
             raise DatasetError(f"{path}: {name} is not finite in row {int(np.argmax(bad))}")
     if np.abs(arrays["action"]).max(initial=0.0) > 1.0 + 1e-6:
         raise DatasetError(f"{path}: actions reach {np.abs(arrays['action']).max():.3g}, limit 1")
-    return header, Transition(**{name: arrays[name] for name in shapes})
+    return header, Transition(**{name: jnp.asarray(arrays[name]) for name in FIELDS})
 
 
 def _load(path: Path) -> tuple[DatasetHeader, dict[str, np.ndarray]]:

@@ -15,8 +15,7 @@ from twirl_mjx.replay.ring import RingBuffer
 from twirl_mjx.types import Transition
 
 
-@flax.struct.dataclass
-class MixedReplay:
+class MixedReplay(flax.struct.PyTreeNode):
     """Frozen source experience beside the growing online experience."""
 
     source: RingBuffer | None

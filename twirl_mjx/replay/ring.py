@@ -13,8 +13,7 @@ import jax.numpy as jnp
 from twirl_mjx.types import Transition
 
 
-@flax.struct.dataclass
-class RingBuffer:
+class RingBuffer(flax.struct.PyTreeNode):
     """The last ``capacity`` transitions that were inserted.
 
     Rows ``[0, size)`` are filled; when the buffer is full the oldest row is the next to be

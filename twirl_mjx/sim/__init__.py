@@ -1,0 +1,1 @@
+"""The robot, its worlds and their physics."""

@@ -33,8 +33,7 @@ COOLING_TIME = 60.0
 """s, time constant of cooling towards the ambient temperature."""
 
 
-@flax.struct.dataclass
-class FilterState:
+class FilterState(flax.struct.PyTreeNode):
     """Memory of the Butterworth filter of one world, joint targets in rad."""
 
     inputs: jax.Array
@@ -43,8 +42,7 @@ class FilterState:
     """[2, 12] the last two outputs, newest first, before the joint-limit clip."""
 
 
-@flax.struct.dataclass
-class MotorState:
+class MotorState(flax.struct.PyTreeNode):
     """Condition of the 12 motors of one world (order FR FL RR RL x hip thigh calf)."""
 
     strength: jax.Array
@@ -53,8 +51,7 @@ class MotorState:
     """[12] deg C."""
 
 
-@flax.struct.dataclass
-class MotorCommand:
+class MotorCommand(flax.struct.PyTreeNode):
     """What the physics engine is given for one control step of one world."""
 
     target: jax.Array
@@ -143,9 +140,7 @@ def pd_torque(command: MotorCommand, joint_pos: jax.Array, joint_vel: jax.Array)
     return jnp.clip(raw, -command.torque_limit, command.torque_limit)
 
 
-def motor_heat(
-    motors: MotorState, dynamics: Dynamics, torque: jax.Array, dt: float
-) -> MotorState:
+def motor_heat(motors: MotorState, dynamics: Dynamics, torque: jax.Array, dt: float) -> MotorState:
     """Advance the motor temperatures by one control step.
 
     dT/dt = heat_rate * mean(torque^2) - (T - ambient) / COOLING_TIME; without heating the

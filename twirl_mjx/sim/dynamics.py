@@ -21,8 +21,7 @@ SceneKind = Literal["flat", "bumpy", "sloped"]
 """Ground geometry compiled into a scene; see ``sim.scene``."""
 
 
-@flax.struct.dataclass
-class Dynamics:
+class Dynamics(flax.struct.PyTreeNode):
     """Physical parameters, scalars for one world or ``[N]`` for a batch (float32)."""
 
     gravity: jax.Array
@@ -70,7 +69,7 @@ SHIFTS: dict[str, Shift] = {
     "sloped": Shift("sloped", (("incline", math.radians(8.0)),), "8 degree hill 0.5 m ahead"),
     "gravity": Shift("flat", (("gravity", 3.7),), "gravity 3.7 m/s^2"),
 }
-"""Spec section 6. ``strength`` interpolates linearly from nominal (0) over the paper's value (1)."""
+"""Spec section 6. ``strength`` interpolates from nominal (0) over the paper's value (1)."""
 
 
 def nearest(name: str, choices: list[str]) -> str:

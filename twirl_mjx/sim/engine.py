@@ -26,8 +26,7 @@ from twirl_mjx.sim.scene import Scene
 EngineName = Literal["auto", "mjx", "native"]
 
 
-@flax.struct.dataclass
-class Trace:
+class Trace(flax.struct.PyTreeNode):
     """State after every physics substep of one control step of all worlds."""
 
     qpos: jax.Array
@@ -111,7 +110,7 @@ def apply_dynamics(scene: Scene, command: MotorCommand, dynamics: Dynamics) -> m
     ground = jnp.asarray(scene.ground_geoms)
     limit = jnp.stack([-command.torque_limit, command.torque_limit], axis=-1)
     changes = {
-        "opt": model.opt.replace(gravity=jnp.stack([0.0 * dynamics.gravity] * 2 + [-dynamics.gravity])),
+        "opt": model.opt.replace(gravity=dynamics.gravity * jnp.array([0.0, 0.0, -1.0])),
         "geom_friction": model.geom_friction.at[ground, 0].set(dynamics.friction),
         "actuator_gainprm": model.actuator_gainprm.at[:, 0].set(command.kp),
         "actuator_biasprm": model.actuator_biasprm.at[:, 1]
@@ -151,17 +150,10 @@ class NativeEngine:
     ) -> tuple[mjx.Data, Trace]:
         """Advance all worlds; see :class:`Engine`."""
         num_envs, n_substeps = data.qpos.shape[0], self._scene.options.n_substeps
-        physics = jnp.concatenate(
-            [
-                jnp.stack(
-                    [dynamics.gravity, dynamics.friction, dynamics.incline, dynamics.bump_height], -1
-                ),
-                command.kp,
-                command.kd,
-                command.torque_limit,
-            ],
-            axis=-1,
-        )
+        d = dynamics
+        scalars = jnp.stack([d.gravity, d.friction, d.incline, d.bump_height], axis=-1)
+        motors = (command.kp, command.kd, command.torque_limit)
+        physics = jnp.concatenate([scalars, *motors], axis=-1)
         out = jax.ShapeDtypeStruct((num_envs, n_substeps, 37), jnp.float32)
         states = jax.pure_callback(
             self._host_step,

@@ -49,15 +49,9 @@ def multiply(a: jax.Array, b: jax.Array) -> jax.Array:
 def base_axes(quat: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Return the base x-, y- and z-axes in the world frame, three arrays [..., 3]."""
     w, x, y, z = quat[..., 0], quat[..., 1], quat[..., 2], quat[..., 3]
-    x_axis = jnp.stack(
-        [1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)], axis=-1
-    )
-    y_axis = jnp.stack(
-        [2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)], axis=-1
-    )
-    z_axis = jnp.stack(
-        [2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], axis=-1
-    )
+    x_axis = jnp.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)], axis=-1)
+    y_axis = jnp.stack([2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)], axis=-1)
+    z_axis = jnp.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], axis=-1)
     return x_axis, y_axis, z_axis
 
 

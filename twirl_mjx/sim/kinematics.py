@@ -37,8 +37,7 @@ REACH_LIMITS = (_reach(a1.JOINT_LIMITS[2, 0]), _reach(a1.JOINT_LIMITS[2, 1]))
 """(shortest, longest) m, thigh joint to foot centre at the calf joint's limits."""
 
 
-@flax.struct.dataclass
-class Points:
+class Points(flax.struct.PyTreeNode):
     """World-frame positions of the robot's contact shapes."""
 
     endpoints: jax.Array

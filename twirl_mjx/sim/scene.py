@@ -102,7 +102,11 @@ def unit_bumps() -> np.ndarray:
 def _add_ground(spec: mujoco.MjSpec, kind: SceneKind) -> tuple[str, ...]:
     world = spec.worldbody
     common = dict(
-        contype=1, conaffinity=0, priority=1, condim=3, friction=[1.0, 0.005, 0.0001],
+        contype=1,
+        conaffinity=0,
+        priority=1,
+        condim=3,
+        friction=[1.0, 0.005, 0.0001],
         material="ground",
     )
     if kind == "bumpy":
@@ -156,8 +160,11 @@ def _add_look(spec: mujoco.MjSpec) -> None:
         height=128,
     )
     spec.worldbody.add_light(
-        pos=[0, 0, 6], dir=[0.2, 0.3, -1.0], type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
-        diffuse=[0.7, 0.7, 0.7], castshadow=True,
+        pos=[0, 0, 6],
+        dir=[0.2, 0.3, -1.0],
+        type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
+        diffuse=[0.7, 0.7, 0.7],
+        castshadow=True,
     )
     spec.visual.headlight.ambient = [0.35, 0.35, 0.35]
     spec.visual.global_.offwidth = 1280
@@ -225,12 +232,20 @@ def build_scene(
     if goal_marker:
         goal = spec.worldbody.add_body(name="goal", mocap=True)
         goal.add_geom(
-            type=mujoco.mjtGeom.mjGEOM_CYLINDER, size=[0.06, 0.005, 0], contype=0, conaffinity=0,
-            rgba=[0.10, 0.65, 0.25, 0.9], pos=[0, 0, 0.005],
+            type=mujoco.mjtGeom.mjGEOM_CYLINDER,
+            size=[0.06, 0.005, 0],
+            contype=0,
+            conaffinity=0,
+            rgba=[0.10, 0.65, 0.25, 0.9],
+            pos=[0, 0, 0.005],
         )
         goal.add_geom(
-            type=mujoco.mjtGeom.mjGEOM_CAPSULE, size=[0.008, 0.15, 0], contype=0, conaffinity=0,
-            rgba=[0.10, 0.65, 0.25, 0.6], pos=[0, 0, 0.15],
+            type=mujoco.mjtGeom.mjGEOM_CAPSULE,
+            size=[0.008, 0.15, 0],
+            contype=0,
+            conaffinity=0,
+            rgba=[0.10, 0.65, 0.25, 0.6],
+            pos=[0, 0, 0.15],
         )
     spec.option.timestep = options.sim_dt
     spec.option.iterations = options.iterations

@@ -70,9 +70,7 @@ def rectangle_distance(start: jax.Array, end: jax.Array) -> jax.Array:
     return jnp.where(apart, jnp.sqrt(least), 0.0)
 
 
-def shape_distance(
-    x: jax.Array, height: jax.Array, radii: jax.Array, band: jax.Array
-) -> jax.Array:
+def shape_distance(x: jax.Array, height: jax.Array, radii: jax.Array, band: jax.Array) -> jax.Array:
     """Return the distance from capsules to a band.
 
     Args:

@@ -25,8 +25,7 @@ LIFTED = 0.01
 """m, a foot counts as off the ground above this clearance."""
 
 
-@flax.struct.dataclass
-class World:
+class World(flax.struct.PyTreeNode):
     """Everything about one world that is not physics: clocks, memories, the episode's draws."""
 
     key: jax.Array
@@ -49,8 +48,7 @@ class World:
     """State of the task itself (a struct of the task's own)."""
 
 
-@flax.struct.dataclass
-class Start:
+class Start(flax.struct.PyTreeNode):
     """The first state of an episode of one world."""
 
     qpos: jax.Array
@@ -60,8 +58,7 @@ class Start:
     task: Any
 
 
-@flax.struct.dataclass
-class View:
+class View(flax.struct.PyTreeNode):
     """What happened to one world in one control step, as the terms of a task see it."""
 
     qpos: jax.Array
@@ -76,8 +73,7 @@ class View:
     """m, base over the local ground."""
 
 
-@flax.struct.dataclass
-class Outcome:
+class Outcome(flax.struct.PyTreeNode):
     """A task's verdict on one control step of one world."""
 
     reward: jax.Array
@@ -90,10 +86,25 @@ class Outcome:
 class Task(Protocol):
     """A Markov decision process over the A1; methods are pure, for one world, and vmappable."""
 
-    name: str
-    collision: CollisionSet
-    observer: Observer
-    metric_names: tuple[str, ...]
+    @property
+    def name(self) -> str:
+        """Name of the task."""
+        ...
+
+    @property
+    def collision(self) -> CollisionSet:
+        """Robot geoms the contact solver sees."""
+        ...
+
+    @property
+    def observer(self) -> Observer:
+        """What the policy sees."""
+        ...
+
+    @property
+    def metric_names(self) -> tuple[str, ...]:
+        """Names of the metrics of every outcome."""
+        ...
 
     def start(self, key: jax.Array, scene: Scene, dynamics: Dynamics) -> Start:
         """Draw the first state of an episode."""

@@ -19,8 +19,7 @@ from twirl_mjx.tasks import base, rewards
 from twirl_mjx.tasks.observations import ProprioceptiveObserver
 
 
-@flax.struct.dataclass
-class BipedState:
+class BipedState(flax.struct.PyTreeNode):
     """State of the task in one world."""
 
     previous_distance: jax.Array

@@ -8,6 +8,7 @@ the ground.
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import flax.struct
@@ -30,14 +31,13 @@ PASSED = 0.4
 MAX_SPEED = 4.0
 """m/s, there are hurdles enough for an episode at this speed (the A1's best is 3.3 m/s)."""
 BUMPY_START_X = (-BUMP_HALF_SIZE + 1.0, -BUMP_HALF_SIZE + 11.0)
-"""m, on bumpy ground episodes start in this range of x, near one edge, to run across the terrain."""
+"""m, on bumpy ground episodes start in this range of x, near one edge, to run across it."""
 FOOT_CONTACT = 0.001
 """m, a foot below this clearance is on the ground: contacts on a slope, measured straight down,
 begin above 0."""
 
 
-@flax.struct.dataclass
-class HurdlesState:
+class HurdlesState(flax.struct.PyTreeNode):
     """State of the task in one world."""
 
     start: jax.Array
@@ -52,8 +52,7 @@ class HurdlesState:
     """[H] bool, passed with all feet off the ground during the whole crossing."""
 
 
-@flax.struct.dataclass
-class Crossing:
+class Crossing(flax.struct.PyTreeNode):
     """What the substeps of one control step mean for the hurdles."""
 
     hit: jax.Array
@@ -88,7 +87,8 @@ def advance(state: HurdlesState, crossing: Crossing, x: jax.Array) -> HurdlesSta
     beyond = state.positions + PASSED < x
     stepped_in = state.stepped_in | crossing.stepped_in
     behind = crossing.last_foot > state.positions + bands.HURDLE_LENGTH / 2
-    return state.replace(
+    return dataclasses.replace(
+        state,
         passed=jnp.maximum(state.passed, jnp.sum(beyond, dtype=jnp.int32)),
         stepped_in=stepped_in,
         cleared=state.cleared | (beyond & behind & ~stepped_in),
@@ -129,7 +129,8 @@ class Hurdles:
                 f" {bands.MIN_GAP} m and the largest no smaller"
                 f" (nearest: {max(low, bands.MIN_GAP)} to {max(low, high, bands.MIN_GAP)})"
             )
-        seconds = config.env.episode_length * CONTROL_DT
+        env = config.env
+        seconds = max(env.episode_length, env.train_episode_length or 0) * CONTROL_DT
         self.num_hurdles = math.ceil(seconds * MAX_SPEED / low) + 1
         """H, never all passed in an episode."""
         self.observer = ProprioceptiveObserver(axes=False)

@@ -10,6 +10,7 @@ height is taken as a height over the ground under the robot.
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 import flax.struct
@@ -92,15 +93,8 @@ def facing_x(clip: Clip) -> Clip:
     mean = np.arctan2(np.sin(yaw).mean(), np.cos(yaw).mean())
     turn = Rotation.from_euler("z", -mean)
     quat = turn * Rotation.from_quat(clip.root_quat, scalar_first=True)
-    return Clip(
-        root_pos=turn.apply(clip.root_pos),
-        root_quat=quat.as_quat(scalar_first=True),
-        joint_pos=clip.joint_pos,
-        frame_duration=clip.frame_duration,
-        loop=clip.loop,
-        cycle_offset_position=clip.cycle_offset_position,
-        cycle_offset_rotation=clip.cycle_offset_rotation,
-        name=clip.name,
+    return dataclasses.replace(
+        clip, root_pos=turn.apply(clip.root_pos), root_quat=quat.as_quat(scalar_first=True)
     )
 
 
@@ -116,8 +110,7 @@ def feet_from_root(qpos: jax.Array) -> jax.Array:
     return frames.rotate(tilt, kinematics.foot_positions(qpos[7:]))
 
 
-@flax.struct.dataclass
-class ImitateMemory:
+class ImitateMemory(flax.struct.PyTreeNode):
     """Memory of :class:`ImitateObserver`: the reference's clock and place, and a history."""
 
     start_time: jax.Array
@@ -131,7 +124,7 @@ class ImitateMemory:
 
     @property
     def elapsed(self) -> jax.Array:
-        """s since the start of the episode."""
+        """Time in s since the start of the episode."""
         return self.step * jnp.float32(CONTROL_DT)
 
 
@@ -144,9 +137,9 @@ class ImitateObserver:
     def __init__(self, clip: Clip) -> None:
         """Keep a wrapping clip."""
         self.layout = LAYOUT
+        self.clip = clip.to_arrays()
         self.duration = clip.cycle_duration
         """s, length of a cycle."""
-        self._clip = clip.to_arrays()
 
     def init(self, qpos: jax.Array, qvel: jax.Array) -> ImitateMemory:
         """Start the clip at its first frame, at the robot's place."""
@@ -168,10 +161,11 @@ class ImitateObserver:
         """Advance clock and history; a new cycle starts at the robot's place."""
         del qvel
         history = jnp.concatenate([memory.history[1:], _frame(qpos, action)[None]])
-        new = memory.replace(step=memory.step + 1, history=history)
+        new = dataclasses.replace(memory, step=memory.step + 1, history=history)
         time = self.time(new)
         looped = self.cycles(time) > self.cycles(self.time(memory))
-        return new.replace(offset=jnp.where(looped, self._offset(time, qpos), new.offset))
+        offset = jnp.where(looped, self._offset(time, qpos), new.offset)
+        return dataclasses.replace(new, offset=offset)
 
     def observe(
         self, memory: ImitateMemory, goal: jax.Array, qpos: jax.Array, qvel: jax.Array
@@ -179,7 +173,7 @@ class ImitateObserver:
         """Return [160] numbers in the order of ``LAYOUT``; the goal is not looked at."""
         del goal, qvel
         times = self.time(memory) + CONTROL_DT * jnp.array(TARGET_STEPS, jnp.float32)
-        target = jax.vmap(lambda time: sample(self._clip, time)[0])(times)
+        target = jax.vmap(lambda time: sample(self.clip, time)[0])(times)
         target = target.at[:, :2].add(memory.offset)
         yaw = frames.yaw(qpos[3:7])
         displacement = frames.rotate(frames.from_yaw(-yaw), target[:, :3] - qpos[:3])
@@ -192,7 +186,7 @@ class ImitateObserver:
 
     def reference(self, memory: ImitateMemory) -> tuple[jax.Array, jax.Array]:
         """Return qpos [19] and qvel [18] of the reference at present."""
-        qpos, qvel = sample(self._clip, self.time(memory))
+        qpos, qvel = sample(self.clip, self.time(memory))
         return qpos.at[:2].add(memory.offset), qvel
 
     def cycles(self, elapsed: jax.Array) -> jax.Array:
@@ -202,7 +196,7 @@ class ImitateObserver:
 
     def _offset(self, time: jax.Array, qpos: jax.Array) -> jax.Array:
         """Return the offset [2] in m that puts the reference at the robot's xy at ``time``."""
-        return qpos[:2] - sample(self._clip, time)[0][:2]
+        return qpos[:2] - sample(self.clip, time)[0][:2]
 
 
 def _frame(qpos: jax.Array, action: jax.Array) -> jax.Array:
@@ -211,8 +205,7 @@ def _frame(qpos: jax.Array, action: jax.Array) -> jax.Array:
     return jnp.concatenate([tilt, qpos[7:], action])
 
 
-@flax.struct.dataclass
-class ImitateState:
+class ImitateState(flax.struct.PyTreeNode):
     """State of the task in one world."""
 
     airborne_steps: jax.Array
@@ -248,10 +241,8 @@ class Imitate:
         place_key, phase_key = jax.random.split(key)
         phase = jax.random.uniform(phase_key, maxval=self.observer.duration)
         xy = base.start_xy(place_key, scene)
-        anywhere = jnp.zeros(19).at[:2].set(xy).at[3].set(1.0)
-        memory = self.observer.init_at(phase, anywhere, jnp.zeros(18))
-        qpos, qvel = self.observer.reference(memory)
-        qpos = qpos.at[2].add(base.ground_at(scene, dynamics, xy))
+        qpos, qvel = sample(self.observer.clip, phase)
+        qpos = qpos.at[:2].set(xy).at[2].add(base.ground_at(scene, dynamics, xy))
         endpoints = kinematics.forward(qpos).endpoints
         lowest = jnp.min(base.clearances(scene, dynamics, endpoints))
         qpos = qpos.at[2].add(jnp.maximum(-lowest, 0.0))

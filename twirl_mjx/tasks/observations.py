@@ -78,15 +78,12 @@ class Observer(Protocol):
         """Return the memory after a control step: the new state and the action that led to it."""
         ...
 
-    def observe(
-        self, memory: Any, goal: jax.Array, qpos: jax.Array, qvel: jax.Array
-    ) -> jax.Array:
+    def observe(self, memory: Any, goal: jax.Array, qpos: jax.Array, qvel: jax.Array) -> jax.Array:
         """Return the observation [O] of the present state, which was pushed last."""
         ...
 
 
-@flax.struct.dataclass
-class HistoryMemory:
+class HistoryMemory(flax.struct.PyTreeNode):
     """Memory of :class:`ProprioceptiveObserver`."""
 
     start_pos: jax.Array

@@ -20,8 +20,7 @@ MAX_STATE = 1e4
 """A world whose position or velocity exceeds this (SI units) counts as diverged."""
 
 
-@flax.struct.dataclass
-class EnvState:
+class EnvState(flax.struct.PyTreeNode):
     """State of N worlds between two control steps; reset and step return identical shapes."""
 
     data: mjx.Data
@@ -212,9 +211,7 @@ class VectorEnv:
     def _restart(self, state: EnvState) -> EnvState:
         """Start new episodes in the worlds whose episode ended; leave the others untouched."""
         done = state.done
-        qpos, qvel, world, obs = jax.vmap(self._start_world)(
-            state.world.key, state.world.dynamics
-        )
+        qpos, qvel, world, obs = jax.vmap(self._start_world)(state.world.key, state.world.dynamics)
         fresh = _place(make_data(self.scene, self.num_envs), qpos, qvel)
         return state.replace(
             data=_select(done, fresh, state.data),
@@ -233,7 +230,7 @@ def _place(data: mjx.Data, qpos: jax.Array, qvel: jax.Array) -> mjx.Data:
     return data.replace(qpos=qpos, qvel=qvel, ctrl=qpos[:, 7:])
 
 
-def _select(mask: jax.Array, new: EnvState, old: EnvState) -> EnvState:
+def _select[T](mask: jax.Array, new: T, old: T) -> T:
     """Take leaves [N, ...] of ``new`` where ``mask`` [N], else of ``old``."""
 
     def pick(a: jax.Array, b: jax.Array) -> jax.Array:

@@ -1,0 +1,1 @@
+"""Where simulation, tasks, replay and learner meet: runs, their stages and their files."""

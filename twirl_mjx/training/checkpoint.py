@@ -131,9 +131,7 @@ class Checkpoints:
         step = self.latest()
         if step is None:
             raise FileNotFoundError(f"no checkpoint in {self._root}")
-        bare = template.replace(
-            replay=template.replay.replace(source=None, online=_bare(template))
-        )
+        bare = template.replace(replay=template.replay.replace(source=None, online=_bare(template)))
         flat = _abstract(bare)
         found = self._manager.restore(
             step,
@@ -218,9 +216,11 @@ def _bare(state: TrainState) -> Any:
 
 def _open(run_dir: Path) -> tuple[ocp.CheckpointManager, int]:
     root = (run_dir / "checkpoints" / "orbax").resolve()
-    manager = ocp.CheckpointManager(
-        root, item_names=("policy", "train_state", "progress")
-    ) if root.is_dir() else None
+    manager = (
+        ocp.CheckpointManager(root, item_names=("policy", "train_state", "progress"))
+        if root.is_dir()
+        else None
+    )
     step = manager.latest_step() if manager is not None else None
     if manager is None or step is None:
         raise FileNotFoundError(f"{run_dir} has no checkpoint: its train state is needed here")
@@ -234,9 +234,9 @@ def load_learner(run_dir: Path) -> dict[str, Any]:
         FileNotFoundError: The run has no checkpoint.
     """
     manager, step = _open(run_dir)
-    flat = manager.restore(
-        step, args=ocp.args.Composite(train_state=ocp.args.StandardRestore())
-    )["train_state"]
+    flat = manager.restore(step, args=ocp.args.Composite(train_state=ocp.args.StandardRestore()))[
+        "train_state"
+    ]
     manager.close()
     nested: dict[str, Any] = {}
     for name, value in flat.items():

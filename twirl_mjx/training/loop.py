@@ -21,7 +21,7 @@ from twirl_mjx.config import TrainConfig
 from twirl_mjx.droq import learner as droq
 from twirl_mjx.droq.state import DroqState
 from twirl_mjx.evaluation.rollout import make_evaluate
-from twirl_mjx.policies.learned import PolicyHeader, save_policy
+from twirl_mjx.policies.learned import PolicyHeader, read_actor, save_policy
 from twirl_mjx.replay.ring import RingBuffer
 from twirl_mjx.tasks.observations import layout_slices
 from twirl_mjx.tasks.registry import make_env
@@ -83,9 +83,7 @@ def no_memory(env_state: Any) -> tuple[()]:
     return ()
 
 
-def make_header(
-    config: TrainConfig, env: VectorEnv, card: dict[str, Any]
-) -> PolicyHeader:
+def make_header(config: TrainConfig, env: VectorEnv, card: dict[str, Any]) -> PolicyHeader:
     """Return the header of a policy file of this run."""
     layout = env.task.observer.layout
     slices = layout_slices(layout)
@@ -289,12 +287,9 @@ def train(
 
 def final_evaluation(config: TrainConfig, run_dir: Path, env_steps: int) -> dict[str, float]:
     """Evaluate the best policy of a run on fresh seeds and write ``eval.csv``."""
-    from twirl_mjx.policies.learned import load_policy
-
-    policy = load_policy(run_dir / "policy.npz")
+    actor = jax.tree.map(jnp.asarray, read_actor(run_dir / "policy.npz"))
     env = make_env(config, num_envs=config.eval.final_episodes)
     evaluate = make_evaluate(env, no_memory, act_mean)
-    actor = jax.tree.map(jnp.asarray, dict(policy.actor_params))
     values = evaluate(actor, jax.random.key(config.eval.seed + 1))
     write_episodes(run_dir / EVAL_CSV, rundir.identity(run_dir, config), env_steps, values)
     return {name: float(np.mean(v)) for name, v in values.items()}

@@ -164,9 +164,7 @@ def _from_path(config: TrainConfig, path: Path) -> Source:
     return Source(found.policy, str(path), digest, found.loaded)
 
 
-def source_data(
-    config: TrainConfig, run_dir: Path, source: Source, say: Say
-) -> ring.RingBuffer:
+def source_data(config: TrainConfig, run_dir: Path, source: Source, say: Say) -> ring.RingBuffer:
     """Return the frozen source ring: a nominal run's replay, or freshly collected experience.
 
     Collected data are kept in ``run_dir/source.npz`` and used again while they fit.
@@ -174,7 +172,7 @@ def source_data(
     env = make_env(config)
     if config.shift != "none" and source.run_dir is not None:
         rows = load_replay(source.run_dir)
-        data = ring.from_rows(rows, env.observation_size, env.action_size)
+        data = ring.from_rows(jnp.asarray(rows), env.observation_size, env.action_size)
         say(f"source data: the replay of {source.run_dir}, {len(rows):,} transitions")
         return data
     rundir.open_run(run_dir, config)
@@ -211,9 +209,7 @@ def collection_digest(config: TrainConfig, source: Source) -> str:
     return hashlib.sha256(json.dumps(decides, sort_keys=True).encode()).hexdigest()[:12]
 
 
-def write_dataset(
-    config: TrainConfig, source: Source, path: Path, digest: str, say: Say
-) -> Any:
+def write_dataset(config: TrainConfig, source: Source, path: Path, digest: str, say: Say) -> Any:
     """Collect ``config.replay.source_size`` transitions and write them to ``path``."""
     env = make_env(config)
     key = jax.random.fold_in(jax.random.key(config.seed), 0x50)

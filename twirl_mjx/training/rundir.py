@@ -99,9 +99,7 @@ def open_run(run_dir: Path, config: TrainConfig) -> None:
     if path.exists():
         old = config_json.from_json(path.read_text())
         lines = [
-            line
-            for line in config_json.diff(old, config)
-            if not line.startswith(tuple(MAY_CHANGE))
+            line for line in config_json.diff(old, config) if not line.startswith(tuple(MAY_CHANGE))
         ]
         if lines:
             shown = "\n  ".join(lines)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
 
 import flax.struct
 import jax
@@ -19,8 +20,7 @@ from twirl_mjx.tasks.vector import EnvState, VectorEnv, make_transition
 from twirl_mjx.types import Metrics
 
 
-@flax.struct.dataclass
-class TrainState:
+class TrainState(flax.struct.PyTreeNode):
     """Everything a run needs to go on; one pytree, one donated argument."""
 
     learner: DroqState
@@ -39,8 +39,7 @@ class TrainState:
     """int32, transitions inserted in the online ring, dropped ones excluded."""
 
 
-@flax.struct.dataclass
-class EpisodeSums:
+class EpisodeSums(flax.struct.PyTreeNode):
     """Sums over the episodes that ended, folded over an epoch."""
 
     values: dict[str, jax.Array]
@@ -190,6 +189,8 @@ def train_epoch(
     return state, metrics
 
 
-def compile_epoch(config: TrainConfig, env: VectorEnv):  # noqa: ANN201
+def compile_epoch(
+    config: TrainConfig, env: VectorEnv
+) -> Callable[[TrainState], tuple[TrainState, Metrics]]:
     """Return the jitted epoch; it donates its argument."""
     return jax.jit(functools.partial(train_epoch, config, env), donate_argnums=0)
