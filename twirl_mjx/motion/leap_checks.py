@@ -13,12 +13,13 @@ from dataclasses import dataclass
 
 import mujoco
 import numpy as np
-from scipy import optimize, signal
+from scipy import optimize
 
 from twirl_mjx.motion.clip import Clip, configurations, frame_velocities
 from twirl_mjx.motion.formats import foot_paths
 from twirl_mjx.motion.leap_solver import CONTROL_RATE
 from twirl_mjx.sim import a1
+from twirl_mjx.sim.actuation import BUTTER_A, BUTTER_B
 
 BAND_LENGTH, BAND_HEIGHT = 0.2, 0.01
 """m, hurdle band (spec section 5)."""
@@ -285,11 +286,10 @@ def feed_forward(clip: Clip, dynamics: Dynamics) -> tuple[np.ndarray, np.ndarray
     closed = np.concatenate([ideal, ideal[:1]])
     wanted = np.stack([np.interp(place, grid, column) for column in closed.T], axis=1)
     wanted = wanted.reshape(steps, fine, a1.NUM_JOINTS).mean(axis=1)
-    numerator, denominator = signal.butter(2, 0.4, output="ba")
     delay = np.roll(np.eye(steps), 1, axis=0)
     powers = np.stack([np.eye(steps), delay, delay @ delay])
     lowpass = np.linalg.solve(
-        np.tensordot(denominator, powers, axes=1), np.tensordot(numerator, powers, axes=1)
+        np.tensordot(BUTTER_A, powers, axes=1), np.tensordot(BUTTER_B, powers, axes=1)
     )
     actions = np.zeros((steps, a1.NUM_JOINTS))
     for joint in range(a1.NUM_JOINTS):

@@ -17,7 +17,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import optimize, signal
+from scipy import optimize
 
 from twirl_mjx.motion.leap_config import LeapConfig
 from twirl_mjx.motion.leap_plan import (
@@ -30,6 +30,7 @@ from twirl_mjx.motion.leap_plan import (
 )
 from twirl_mjx.motion.planar import GRAVITY, PlanarModel, joint_torques
 from twirl_mjx.sim import a1
+from twirl_mjx.sim.actuation import BUTTER_A, BUTTER_B
 
 CONTROL_RATE = 20.0
 """Hz, of the policy (paper, section "Actions")."""
@@ -120,9 +121,8 @@ def filter_gains(count: int, duration: float) -> tuple[np.ndarray, np.ndarray]:
         Gain from PD target to unfiltered target, and from PD target to the part reached.
     """
     frequency = np.fft.rfftfreq(count, duration / count)
-    numerator, denominator = signal.butter(2, 0.4, output="ba")
-    angle = 2 * np.pi * np.minimum(frequency / CONTROL_RATE, 0.5)
-    _, response = signal.freqz(numerator, denominator, worN=angle)
+    delay = np.exp(-2j * np.pi * np.minimum(frequency / CONTROL_RATE, 0.5))
+    response = np.polyval(BUTTER_B[::-1], delay) / np.polyval(BUTTER_A[::-1], delay)
     magnitude = np.abs(response) * np.sinc(frequency / CONTROL_RATE)
     magnitude[frequency > 0.45 * CONTROL_RATE] = 0.0
     inverse = magnitude / (magnitude**2 + 0.02**2)

@@ -15,6 +15,7 @@ from scipy import signal
 from twirl_mjx.motion.clip import Clip, frame_velocities
 from twirl_mjx.motion.leap_checks import CONTROL_RATE, feed_forward, inverse_dynamics
 from twirl_mjx.sim import a1
+from twirl_mjx.sim.actuation import BUTTER_A, BUTTER_B
 
 
 def robot_on_floor() -> mujoco.MjModel:
@@ -54,9 +55,8 @@ def open_loop(clip: Clip, start: float, duration: float) -> tuple[np.ndarray, np
     """
     actions, _, _ = feed_forward(clip, inverse_dynamics(clip))
     cycle, targets = len(actions), a1.DEFAULT_POSE + actions * a1.ACTION_HALF_RANGE
-    numerator, denominator = signal.butter(2, 0.4, output="ba")
     repeated = np.tile(targets, (8, 1))
-    settled = np.asarray(signal.lfilter(numerator, denominator, repeated, axis=0))[-cycle:]
+    settled = np.asarray(signal.lfilter(BUTTER_B, BUTTER_A, repeated, axis=0))[-cycle:]
     model = robot_on_floor()
     data = mujoco.MjData(model)
     first = round(start * CONTROL_RATE)
