@@ -74,22 +74,18 @@ def run(config: TrainConfig, preset: str, runs_dir: Path, name: str | None, say:
             f"task {config.task} has no source policy, so variant {config.variant!r} does not"
             " apply (nearest: 'scratch')"
         )
-    with rundir.exclusive(run_dir):
-        return _run(config, preset, runs_dir, run_dir, say)
-
-
-def _run(config: TrainConfig, preset: str, runs_dir: Path, run_dir: Path, say: Say) -> Path:
-    """Do the work of :func:`run` while the run directory is held."""
     if config.variant == "scratch":
-        return _train(config, run_dir, None, None)
+        with rundir.exclusive(run_dir):
+            return _train(config, run_dir, None, None)
     source = find_source(config, preset, runs_dir, say)
-    if config.variant == "zero-shot":
-        return zero_shot(config, run_dir, source, say)
-    data = source_data(config, run_dir, source, say) if config.uses_source_data else None
-    initial = None
-    if config.variant in ("weights", "twirl+weights"):
-        initial = source_weights(config, source, say)
-    return _train(config, run_dir, data, initial)
+    with rundir.exclusive(run_dir):
+        if config.variant == "zero-shot":
+            return zero_shot(config, run_dir, source, say)
+        data = source_data(config, run_dir, source, say) if config.uses_source_data else None
+        initial = None
+        if config.variant in ("weights", "twirl+weights"):
+            initial = source_weights(config, source, say)
+        return _train(config, run_dir, data, initial)
 
 
 def _train(
@@ -135,6 +131,7 @@ def find_source(config: TrainConfig, preset: str, runs_dir: Path, say: Say) -> S
     source_dir = runs_dir / rundir.default_name(source_config, preset)
     say(f"stage 1 of 3: source policy, task {source_task}, in {source_dir}")
     with rundir.exclusive(source_dir):
+        with rundir.exclusive(source_dir):
         _train(source_config, source_dir, None, None)
     return _from_path(config, source_dir)
 

@@ -1,0 +1,64 @@
+"""``twirl demo``."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from pathlib import Path
+
+import numpy as np
+
+from twirl_mjx.assets import asset_path
+from twirl_mjx.commands.options import parse, say
+from twirl_mjx.commands.render import RenderOptions, film
+from twirl_mjx.config import TASKS, check_range
+from twirl_mjx.evaluation.rollout import make_evaluate
+from twirl_mjx.policies.resolve import resolve_policy
+from twirl_mjx.presets import make_config
+from twirl_mjx.tasks.registry import make_env
+
+
+@dataclasses.dataclass(frozen=True)
+class DemoOptions:
+    """Evaluate and film the shipped policies; downloads nothing, trains nothing."""
+
+    episodes: int = 16
+    """Episodes per policy."""
+    seed: int = 3_000_017
+    """Seed of the episodes."""
+    out: Path = Path("runs/demo")
+    """Folder of the films."""
+    film: bool = True
+    """Also film one episode of each."""
+
+
+def main(argv: list[str]) -> int:
+    """Show every policy in ``assets/policies``."""
+    options = parse(DemoOptions, argv, "twirl demo")
+    check_range("episodes", options.episodes, 1, 100_000)
+    folder = asset_path("policies")
+    found = [folder / f"{task}.npz" for task in TASKS if (folder / f"{task}.npz").is_file()]
+    if not found:
+        raise FileNotFoundError(f"no policy in {folder}: train one with `twirl train`")
+    for path in found:
+        _show(path, options)
+    return 0
+
+
+def _show(path: Path, options: DemoOptions) -> None:
+    import jax
+
+    began = time.monotonic()
+    config = make_config(path.stem)
+    policy = resolve_policy(str(path), config).policy
+
+    def act(params: object, memory: object, state: object, key: jax.Array) -> tuple:
+        return policy.act(memory, state, key)
+
+    env = make_env(config, num_envs=options.episodes)
+    values = make_evaluate(env, policy.init, act)(None, jax.random.key(options.seed))
+    means = ", ".join(f"{name} {np.mean(value):.3g}" for name, value in values.items())
+    say(f"{path.stem}: {means}")
+    if options.film:
+        film(config, RenderOptions(str(path), seed=options.seed), options.out / path.stem)
+    say(f"{path.stem}: {time.monotonic() - began:.0f} s")
