@@ -131,7 +131,6 @@ def find_source(config: TrainConfig, preset: str, runs_dir: Path, say: Say) -> S
     source_dir = runs_dir / rundir.default_name(source_config, preset)
     say(f"stage 1 of 3: source policy, task {source_task}, in {source_dir}")
     with rundir.exclusive(source_dir):
-        with rundir.exclusive(source_dir):
         _train(source_config, source_dir, None, None)
     return _from_path(config, source_dir)
 
