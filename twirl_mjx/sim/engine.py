@@ -19,6 +19,7 @@ import mujoco.rollout
 import numpy as np
 from mujoco import mjx
 
+from twirl_mjx.sim import a1
 from twirl_mjx.sim.actuation import MotorCommand
 from twirl_mjx.sim.dynamics import Dynamics
 from twirl_mjx.sim.scene import Scene
@@ -214,6 +215,15 @@ def _copy_model(model: mujoco.MjModel) -> mujoco.MjModel:
     # A diverging world must show its NaN to the guards instead of silently restarting.
     copy.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
     return copy
+
+
+def world_model(scene: Scene, dynamics: Dynamics) -> mujoco.MjModel:
+    """Return a copy of the scene's model with one world's parameters (scalars), motors whole."""
+    ground = (dynamics.gravity, dynamics.friction, dynamics.incline, dynamics.bump_height)
+    motors = np.repeat([a1.KP, a1.KD, a1.TORQUE_LIMIT], a1.NUM_JOINTS)
+    model = scene.mj_model.__copy__()
+    write_physics(scene, model, np.concatenate([np.array([float(x) for x in ground]), motors]))
+    return model
 
 
 def write_physics(scene: Scene, model: mujoco.MjModel, values: np.ndarray) -> None:

@@ -52,7 +52,7 @@ class GymnasiumEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         self._reset = jax.jit(env.reset)
         self._step = jax.jit(self._step_and_read)
         self._state: EnvState | None = None
-        self._qpos = np.zeros(env.mj_model.nq)
+        self._qpos = np.zeros(env.scene.mj_model.nq)
         self._renderer: mujoco.Renderer | None = None
 
     def reset(

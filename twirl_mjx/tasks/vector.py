@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+
 import flax.struct
 import jax
 import jax.numpy as jnp
@@ -10,7 +12,7 @@ from mujoco import mjx
 
 from twirl_mjx.sim import actuation
 from twirl_mjx.sim.dynamics import Dynamics, broadcast
-from twirl_mjx.sim.engine import Engine, Trace, make_data
+from twirl_mjx.sim.engine import Engine, Trace, make_data, world_model
 from twirl_mjx.sim.scene import CONTROL_DT, Scene
 from twirl_mjx.tasks.base import Outcome, Task, World, make_view
 from twirl_mjx.tasks.observations import layout_size
@@ -93,10 +95,10 @@ class VectorEnv:
         """Control step in s."""
         return CONTROL_DT
 
-    @property
+    @functools.cached_property
     def mj_model(self) -> mujoco.MjModel:
-        """The compiled model of the scene."""
-        return self.scene.mj_model
+        """The compiled model of the scene, with the default physical parameters of world 0."""
+        return world_model(self.scene, jax.tree.map(lambda leaf: leaf[0], self.dynamics))
 
     def reset(
         self,

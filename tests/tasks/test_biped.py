@@ -1,0 +1,160 @@
+"""Task ``biped``: reward, measures, terminations and where its goals are."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from twirl_mjx.config import BipedConfig, EnvConfig, TrainConfig
+from twirl_mjx.sim import a1
+from twirl_mjx.tasks.base import Outcome
+from twirl_mjx.tasks.biped import Biped, draw_goal
+
+CONFIG = TrainConfig(task="biped")
+
+
+def numpy_terms(qpos: np.ndarray, goal: np.ndarray, previous: float) -> dict[str, float]:
+    """Return the terms of spec section 5, from the pose alone."""
+    matrix = Rotation.from_quat(qpos[3:7], scalar_first=True).as_matrix()
+    way = goal - qpos[:2]
+    distance = float(np.hypot(*way))
+    down = -matrix[:, 2]
+    facing = (0.5 * float(down[:2] @ way) / distance + 0.5) ** 2
+    upright, bonus = (0.5 * matrix[2, 0] + 0.5) ** 2, float(np.exp(qpos[2]) - 1.0)
+    nearer = 1.0 if distance <= 0.01 else 0.5 * (distance < previous)
+    return {
+        "upright": upright,
+        "height": bonus,
+        "stand": upright + bonus,
+        "facing": facing,
+        "distance": nearer,
+        "goal_distance": distance,
+        "cosine": matrix[2, 0],
+    }
+
+
+def test_reward_recomputed_from_the_state(
+    worlds: Callable[..., Any], actions: Callable[..., np.ndarray], read: Callable[..., Any]
+) -> None:
+    made = worlds("biped")
+    first = made.reset(4)
+    state, checked, nearer = read(first), 0, 0
+    for after in map(read, made.run(first, actions(8, 3, scale=0.8))):
+        for world in np.flatnonzero(~(after.done | state.done)):
+            goal, before, qpos = state.goal[world], state.qpos[world], after.qpos[world]
+            expected = numpy_terms(qpos, goal, float(np.hypot(*(goal - before[:2]))))
+            for name, value in expected.items():
+                got = float(after.metrics[name][world])
+                assert got == pytest.approx(value, abs=1e-5), name
+            total = expected["stand"] * (1.0 + expected["facing"] + expected["distance"])
+            assert float(after.reward[world]) == pytest.approx(total, abs=5e-5)
+            checked += 1
+            nearer += expected["distance"] > 0
+        state = after
+    assert checked >= 12
+    assert 0 < nearer < checked
+
+
+def raised(x: float, pitch_up: float = 90.0, z: float = 0.5) -> np.ndarray:
+    half = np.deg2rad(-pitch_up) / 2
+    return np.concatenate([[x, 0, z, np.cos(half), 0, np.sin(half), 0], a1.DEFAULT_POSE])
+
+
+def test_reward_by_hand(judge: Callable[..., Outcome]) -> None:
+    """Goal 1 m ahead; nose up at 0.5 m: r_stand = 1.6487213, the belly faces +x."""
+    task = Biped(CONFIG)
+    outcome = judge(task, [raised(0.2), raised(1.5), raised(1.005)], previous=0.9)
+    # nearer and facing; nearer but the goal is behind; at the goal with it 5 mm behind
+    expected = 1.6487213 * np.array([1.0 + 1.0 + 0.5, 1.0 + 0.0 + 0.5, 1.0 + 0.0 + 1.0])
+    np.testing.assert_allclose(outcome.reward, expected, rtol=1e-5)
+    np.testing.assert_allclose(outcome.metrics["goal_distance"], [0.8, 0.5, 0.005], atol=1e-6)
+    np.testing.assert_allclose(outcome.task.previous_distance, [0.8, 0.5, 0.005], atol=1e-6)
+    away = judge(task, [raised(0.2)], previous=0.8)  # not nearer than before
+    np.testing.assert_allclose(away.reward, 1.6487213 * 2.0, rtol=1e-5)
+    four = judge(task, [raised(0.0, pitch_up=0.0, z=0.27)], previous=2.0)
+    np.testing.assert_allclose(four.reward, 0.5599645 * (1.0 + 0.25 + 0.5), rtol=1e-5)
+
+
+@pytest.mark.parametrize(("gap", "value"), [(0.0095, 1.0), (0.0105, 0.5)])
+def test_goal_is_reached_within_a_centimetre(
+    judge: Callable[..., Outcome], gap: float, value: float
+) -> None:
+    outcome = judge(Biped(CONFIG), [raised(1.0 - gap)], previous=0.5)
+    assert outcome.metrics["distance"] == pytest.approx(value)
+
+
+def test_knees_may_touch_the_ground_but_nothing_above_them(
+    judge: Callable[..., Outcome], poses: dict[str, np.ndarray]
+) -> None:
+    outcome = judge(Biped(CONFIG), list(poses.values()))
+    assert dict(zip(poses, outcome.terminated.tolist(), strict=True)) == {
+        "on four feet": False,
+        "on the hind feet": False,
+        "kneeling": False,
+        "on its side": True,
+        "on the hips": True,
+        "on its back": True,
+        "on its head": True,
+    }
+
+
+def draw_goals(config: TrainConfig, count: int) -> np.ndarray:
+    """Return the displacements [count, 2] in m of goals drawn around (2, -3)."""
+    start = jnp.array([2.0, -3.0])
+    keys = jax.random.split(jax.random.key(2), count)
+    goals = jax.jit(jax.vmap(lambda key: draw_goal(key, config, start)))(keys)
+    return np.asarray(goals - start)
+
+
+def test_goals_lie_on_a_circle_of_random_radius() -> None:
+    """radius = clip(Exp(1.5), 0.3, 5): mean 0.3 + 1.5 (e^-0.2 - e^(-10/3)) = 1.47459 m."""
+    displacement = draw_goals(CONFIG, 20_000)
+    radius = np.hypot(*displacement.T)
+    assert radius.min() == pytest.approx(0.3, abs=1e-5)
+    assert radius.max() == pytest.approx(5.0, abs=1e-5)
+    assert radius.mean() == pytest.approx(1.47459, abs=0.03)
+    assert (radius < 0.3001).mean() == pytest.approx(1 - np.exp(-0.2), abs=0.01)
+    assert (radius > 4.9999).mean() == pytest.approx(np.exp(-10 / 3), abs=0.005)
+    angle = np.arctan2(displacement[:, 1], displacement[:, 0])
+    counts, _ = np.histogram(angle, bins=8, range=(-np.pi, np.pi))
+    np.testing.assert_allclose(counts, 2500, rtol=0.08)
+
+
+@pytest.mark.parametrize(
+    "config",
+    [
+        TrainConfig(task="biped", shift="icy"),
+        TrainConfig(task="biped", env=EnvConfig(course="fixed")),
+    ],
+)
+def test_fixed_course(config: TrainConfig) -> None:
+    np.testing.assert_allclose(draw_goals(config, 20), np.tile([1.5, 0.0], (20, 1)), atol=1e-6)
+    moved = dataclasses.replace(config, biped=BipedConfig(fixed_goal=(0.5, 2.0)))
+    np.testing.assert_allclose(draw_goals(moved, 20), np.tile([0.5, 2.0], (20, 1)), atol=1e-6)
+
+
+def test_random_course_under_a_shift_when_asked_for() -> None:
+    config = TrainConfig(task="biped", shift="icy", env=EnvConfig(course="random"))
+    assert len(np.unique(draw_goals(config, 20), axis=0)) == 20
+
+
+def test_goal_stays_put_and_observation_points_to_it(
+    worlds: Callable[..., Any], actions: Callable[..., np.ndarray]
+) -> None:
+    made = worlds("biped")
+    first = made.reset(5)
+    radius = np.hypot(*np.asarray(first.world.goal).T)
+    assert (radius >= 0.3 - 1e-6).all()
+    assert len(np.unique(radius)) == 3
+    last = made.run(first, actions(3, 3))[-1]
+    np.testing.assert_array_equal(last.world.goal, first.world.goal)
+    np.testing.assert_allclose(
+        last.obs[:, :2], np.asarray(first.world.goal - last.data.qpos[:, :2]), atol=1e-6
+    )
