@@ -1,0 +1,73 @@
+"""Episode measures by hand: folds, scales, success, reset."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from twirl_mjx.config import TASKS, TrainConfig
+from twirl_mjx.evaluation import measures
+from twirl_mjx.tasks.registry import make_task
+
+
+def make_step(reward: list, standing: list, distance: list, terminated: list) -> SimpleNamespace:
+    zeros = jnp.zeros(len(reward))
+    return SimpleNamespace(
+        reward=jnp.array(reward),
+        terminated=jnp.array(terminated),
+        metrics={
+            "standing": jnp.array(standing),
+            "goal_distance": jnp.array(distance),
+            "cosine": zeros + 0.5,
+        },
+    )
+
+
+def test_biped_measures_by_hand() -> None:
+    tracker = measures.tracker_init("biped", 2)
+    steps = [
+        make_step([1.0, 2.0], [1.0, 0.0], [0.9, 0.4], [False, False]),
+        make_step([3.0, 0.5], [1.0, 1.0], [0.1, 0.6], [False, True]),
+    ]
+    for step in steps:
+        tracker = measures.tracker_step("biped", tracker, step)  # type: ignore[arg-type]
+    values = {k: np.asarray(v) for k, v in measures.tracker_read("biped", tracker).items()}
+    np.testing.assert_allclose(values["return"], [4.0, 2.5])
+    np.testing.assert_allclose(values["episode_length"], [2.0, 2.0])
+    np.testing.assert_allclose(values["standing_time"], [0.1, 0.05])
+    np.testing.assert_allclose(values["min_distance"], [0.1, 0.4])
+    np.testing.assert_allclose(values["cosine"], [0.5, 0.5])
+    np.testing.assert_allclose(values["terminated"], [0.0, 1.0])
+    np.testing.assert_allclose(values["success"], [0.0, 0.0])
+    after = measures.tracker_reset("biped", tracker, jnp.array([True, False]))
+    values = measures.tracker_read("biped", after)
+    np.testing.assert_allclose(values["return"], [0.0, 2.5])
+    assert float(values["min_distance"][0]) == np.inf
+
+
+@pytest.mark.parametrize(
+    ("task", "values", "expected"),
+    [
+        ("stand", {"standing_time": [11.9, 12.0]}, [False, True]),
+        (
+            "biped",
+            {"standing_time": [12.0, 12.0, 11.0], "min_distance": [0.14, 0.15, 0.1]},
+            [True, False, False],
+        ),
+        ("imitate", {"leaps": [2.0, 3.0]}, [False, True]),
+        ("hurdles", {"hurdles_passed": [1.0, 2.0]}, [False, True]),
+    ],
+)
+def test_success_thresholds(task: str, values: dict, expected: list) -> None:
+    arrays = {name: jnp.array(column) for name, column in values.items()}
+    assert np.asarray(measures.success(task, arrays)).tolist() == expected
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_every_measured_signal_exists_in_its_task(task: str) -> None:
+    signals = {m.signal for m in measures.MEASURES[task].values()}
+    known = {"reward", "step", "terminated", *make_task(TrainConfig(task=task)).metric_names}
+    assert signals <= known

@@ -1,0 +1,112 @@
+"""Configs: presets, refusals with numbers, JSON, differences."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+
+import pytest
+
+from twirl_mjx import config_json
+from twirl_mjx.config import (
+    SOURCE_OF,
+    TASKS,
+    DroqConfig,
+    EnvConfig,
+    ReplayConfig,
+    TrainConfig,
+)
+from twirl_mjx.config import SHIFTS as SHIFT_NAMES
+from twirl_mjx.presets import PRESETS, make_config
+from twirl_mjx.sim.dynamics import SHIFTS
+
+
+@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("preset", PRESETS)
+def test_every_preset_builds_and_gives_whole_updates(task: str, preset: str) -> None:
+    config = make_config(task, preset)
+    assert config.task == task
+    assert config.updates_per_step == pytest.approx(config.droq.utd * config.env.num_envs)
+    assert config.blocks_per_step * config.droq.updates_per_block == config.updates_per_step
+    assert config.variant == ("twirl" if task in SOURCE_OF else "scratch")
+    assert make_config(task, preset) == config
+    hash(config)
+
+
+def test_paper_preset_has_the_numbers_of_table_4() -> None:
+    config = make_config("biped", "paper")
+    droq = config.droq
+    assert (droq.batch_size, droq.discount, droq.learning_rate) == (256, 0.99, 3e-4)
+    assert (droq.tau, droq.utd, droq.hidden_sizes) == (0.005, 20.0, (256, 256))
+    assert (droq.initial_temperature, droq.target_entropy) == (1.0, None)
+    assert (config.replay.phi, config.replay.source_size) == (0.5, 50_000)
+    assert config.total_env_steps == 1_000_000
+    assert droq.replay_ratio == 5120.0
+
+
+def test_names_of_shifts_agree_with_the_physics() -> None:
+    assert tuple(SHIFTS) == SHIFT_NAMES
+
+
+@pytest.mark.parametrize(
+    ("build", "message"),
+    [
+        (lambda: TrainConfig(task="bipde"), "nearest: 'biped'"),
+        (lambda: TrainConfig(shift="ice"), "nearest: 'icy'"),
+        (lambda: TrainConfig(variant="twrl"), "nearest: 'twirl'"),  # type: ignore[arg-type]
+        (lambda: make_config("stand", "cpus"), "nearest: 'cpu'"),
+        (lambda: ReplayConfig(phi=-0.1), r"phi = -0.1 is outside \[0.0, 1.0\] \(nearest: 0.0\)"),
+        (lambda: DroqConfig(tau=2.0), r"outside \[0.0, 1.0\] \(nearest: 1.0\)"),
+        (lambda: DroqConfig(discount=float("nan")), "discount"),
+        (lambda: DroqConfig(hidden_sizes=()), "hidden_sizes"),
+        (lambda: EnvConfig(num_envs=0), r"nearest: 1\)"),
+        (lambda: TrainConfig(replay=ReplayConfig(capacity=8)), "capacity 8 is below"),
+    ],
+)
+def test_bad_values_are_refused_with_the_nearest_valid(build, message: str) -> None:  # noqa: ANN001
+    with pytest.raises(ValueError, match=message):
+        build()
+
+
+def test_updates_that_do_not_divide_are_refused_with_the_numbers() -> None:
+    with pytest.raises(ValueError, match=r"1\.25 x env\.num_envs 16 = 20 .*block 16 .*utd 1\)"):
+        TrainConfig(droq=DroqConfig(utd=1.25, updates_per_block=16))
+    with pytest.raises(ValueError, match="whole number"):
+        TrainConfig(env=EnvConfig(num_envs=1), droq=DroqConfig(utd=0.5, updates_per_block=1))
+
+
+def test_variants_decide_phi() -> None:
+    base = TrainConfig(replay=ReplayConfig(phi=0.25))
+    phis = {
+        variant: dataclasses.replace(base, variant=variant).effective_phi
+        for variant in ("scratch", "twirl", "twirl+weights", "weights", "zero-shot")
+    }
+    assert phis == {
+        "scratch": 0.0, "twirl": 0.25, "twirl+weights": 0.25, "weights": 0.0, "zero-shot": 0.0,
+    }  # fmt: skip
+
+
+def test_course_is_fixed_under_a_shift() -> None:
+    assert not TrainConfig().fixed_course
+    assert TrainConfig(shift="icy").fixed_course
+    assert not TrainConfig(shift="icy", env=EnvConfig(course="random")).fixed_course
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_json_round_trip(preset: str) -> None:
+    config = make_config("hurdles", preset)
+    assert config_json.from_json(config_json.to_json(config)) == config
+
+
+def test_json_with_an_unknown_key_is_refused() -> None:
+    record = json.loads(config_json.to_json(TrainConfig()))
+    record["droq"]["dicount"] = 0.9
+    with pytest.raises(ValueError, match="nearest: 'discount'"):
+        config_json.from_json(json.dumps(record))
+
+
+def test_diff_names_every_field_that_differs() -> None:
+    a = TrainConfig()
+    b = dataclasses.replace(a, seed=3, droq=dataclasses.replace(a.droq, tau=0.01))
+    assert config_json.diff(a, b) == ["seed: 0 -> 3", "droq.tau: 0.005 -> 0.01"]
+    assert config_json.diff(a, a) == []
