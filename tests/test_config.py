@@ -8,6 +8,7 @@ import json
 import pytest
 
 from twirl_mjx import config_json
+from twirl_mjx.config import SHIFTS as SHIFT_NAMES
 from twirl_mjx.config import (
     SOURCE_OF,
     TASKS,
@@ -16,7 +17,6 @@ from twirl_mjx.config import (
     ReplayConfig,
     TrainConfig,
 )
-from twirl_mjx.config import SHIFTS as SHIFT_NAMES
 from twirl_mjx.presets import PRESETS, make_config
 from twirl_mjx.sim.dynamics import SHIFTS
 
@@ -63,7 +63,7 @@ def test_names_of_shifts_agree_with_the_physics() -> None:
         (lambda: TrainConfig(replay=ReplayConfig(capacity=8)), "capacity 8 is below"),
     ],
 )
-def test_bad_values_are_refused_with_the_nearest_valid(build, message: str) -> None:  # noqa: ANN001
+def test_bad_values_are_refused_with_the_nearest_valid(build, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         build()
 

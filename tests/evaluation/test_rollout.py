@@ -21,7 +21,7 @@ from twirl_mjx.tasks.vector import EnvState
 
 
 @pytest.fixture(scope="module")
-def config():  # noqa: ANN201
+def config():
     base = make_config("biped", "debug")
     return dataclasses.replace(base, env=EnvConfig(num_envs=4, episode_length=12))
 
@@ -60,7 +60,7 @@ def test_only_the_first_episode_counts() -> None:
     np.testing.assert_array_equal(values["episode_length"], length)
 
 
-def test_conditions_together_equal_conditions_alone(config) -> None:  # noqa: ANN001
+def test_conditions_together_equal_conditions_alone(config) -> None:
     policy = get_scripted("trot")
     together = evaluate_shifts(
         config, policy, episodes=2, seed=3, shifts=("none", "icy", "gravity")
@@ -71,7 +71,7 @@ def test_conditions_together_equal_conditions_alone(config) -> None:  # noqa: AN
     assert not np.allclose(together["none"]["return"], together["gravity"]["return"])
 
 
-def test_recording_has_one_row_per_step(config) -> None:  # noqa: ANN001
+def test_recording_has_one_row_per_step(config) -> None:
     recording = record_episode(config, get_scripted("zero"), seed=0, steps=5)
     assert recording.qpos.shape == (5, 19)
     assert recording.goals.shape == (5, 2)
