@@ -20,7 +20,6 @@ from twirl_mjx.sim.scene import build_scene, terrain_height
 from twirl_mjx.tasks import base, rewards
 from twirl_mjx.tasks.hurdles import WEIGHTS, Hurdles, HurdlesState, advance, watch
 from twirl_mjx.tasks.observations import layout_size, layout_slices
-from twirl_mjx.tasks.registry import make
 
 FLAT = build_scene("flat")
 NOMINAL = make_dynamics()
@@ -261,21 +260,17 @@ def test_measures_are_metrics_of_the_task() -> None:
     assert {m.signal for m in MEASURES["hurdles"].values()} <= known
 
 
-def test_worlds_run_in_one_trace(count_traces: Any) -> None:
-    env = make("hurdles", num_envs=2, engine="native")
-    counter = count_traces(env.step)
-    step = jax.jit(counter)
-    state = jax.jit(env.reset)(jax.random.key(0))
-    avals = list(map(jax.typeof, jax.tree.leaves(state)))
-    for _ in range(3):
-        state = step(state, jnp.zeros((2, 12)))
-    assert counter.traces == 1
-    assert list(map(jax.typeof, jax.tree.leaves(state))) == avals
-    assert state.obs.shape == (2, 95)
-    assert set(state.metrics) == set(TASK.metric_names)
-    assert not state.invalid.any()
-    assert not state.terminated.any()
-    goal = state.world.goal - state.data.qpos[:, :2]
-    np.testing.assert_allclose(state.obs[:, :2], goal, atol=1e-6)
-    total = sum(WEIGHTS[name] * state.metrics[name] for name in WEIGHTS)
-    np.testing.assert_allclose(state.reward, total, rtol=1e-5)
+def test_rewards_of_simulated_worlds(
+    worlds: Callable[..., Any], actions: Callable[..., np.ndarray]
+) -> None:
+    made = worlds("hurdles")
+    first = made.reset(0)
+    assert first.obs.shape == (3, 95)
+    for state in made.run(first, actions(4, 3)):
+        assert not state.invalid.any()
+        total = sum(WEIGHTS[name] * state.metrics[name] for name in WEIGHTS)
+        np.testing.assert_allclose(state.reward, total, rtol=1e-5)
+        assert set(state.metrics) == set(TASK.metric_names)
+    assert made.traces["step"] == 1
+    goal = first.world.goal - first.data.qpos[:, :2]
+    np.testing.assert_allclose(first.obs[:, :2], goal, atol=1e-6)

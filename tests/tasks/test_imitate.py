@@ -34,7 +34,6 @@ from twirl_mjx.tasks.imitate import (
     facing_x,
 )
 from twirl_mjx.tasks.observations import layout_size, layout_slices
-from twirl_mjx.tasks.registry import make
 
 FLAT = build_scene("flat", collision="feet")
 NOMINAL = make_dynamics()
@@ -53,7 +52,7 @@ def synthetic_clip(yaw: float = 0.0, **changes: Any) -> Clip:
     pitch = Rotation.from_euler("y", 0.2 * swing[:, None])
     joints = a1.DEFAULT_POSE + 0.2 * swing[:, None] * np.tile([0.3, 1.0, -1.0], 4)
     clip = Clip(
-        root_pos=turn.apply(np.stack([x, 0.0 * x, z], axis=1)) + [0.4, -0.3, 0.0],
+        root_pos=turn.apply(np.stack([x, 0.0 * x, z], axis=1)) + np.array([0.4, -0.3, 0.0]),
         root_quat=(turn * pitch).as_quat(scalar_first=True),
         joint_pos=joints,
         frame_duration=CYCLE / 48,
@@ -429,18 +428,15 @@ def test_the_shipped_leap_is_a_leap() -> None:
     assert max(map(len, text.split("_"))) >= 2 * FLIGHT_STEPS  # in half control steps
 
 
-def test_worlds_run_in_one_trace(config: TrainConfig, count_traces: Any) -> None:
-    env = make("imitate", num_envs=2, engine="native", config=config)
-    counter = count_traces(env.step)
-    step = jax.jit(counter)
-    state = jax.jit(env.reset)(jax.random.key(0))
-    avals = list(map(jax.typeof, jax.tree.leaves(state)))
-    for _ in range(3):
-        state = step(state, jnp.zeros((2, 12)))
-    assert counter.traces == 1
-    assert list(map(jax.typeof, jax.tree.leaves(state))) == avals
-    assert state.obs.shape == (2, 160)
-    assert set(state.metrics) == set(Imitate.metric_names)
-    assert not state.invalid.any()
-    total = sum(WEIGHTS[name] * state.metrics[name] for name in WEIGHTS)
-    np.testing.assert_allclose(state.reward, total, rtol=1e-5)
+def test_rewards_of_simulated_worlds(
+    worlds: Callable[..., Any], actions: Callable[..., np.ndarray]
+) -> None:
+    made = worlds("imitate")
+    first = made.reset(0)
+    assert first.obs.shape == (3, 160)
+    for state in made.run(first, actions(4, 3)):
+        assert not state.invalid.any()
+        total = sum(WEIGHTS[name] * state.metrics[name] for name in WEIGHTS)
+        np.testing.assert_allclose(state.reward, total, rtol=1e-5)
+        assert set(state.metrics) == set(Imitate.metric_names)
+    assert made.traces["step"] == 1
