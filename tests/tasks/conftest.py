@@ -166,19 +166,29 @@ def poses() -> dict[str, np.ndarray]:
     return made
 
 
+BATCH = 16
+"""Poses judged in one compiled call; shorter lists are filled up with their last pose."""
+
+
 @pytest.fixture(scope="session")
 def judge() -> Callable[..., Outcome]:
     """``judge(task, qpos [K, 19], goal [2], previous_distance)`` -> outcomes of K single steps."""
     scene, dynamics = build_scene("flat"), make_dynamics()
+    compiled: dict[Any, Callable[..., Outcome]] = {}
 
-    def run(task: Task, qpos: Any, goal: Any = (1.0, 0.0), previous: float = 0.0) -> Outcome:
-        def one(pose: jax.Array) -> Outcome:
-            view = base.make_view(scene, dynamics, pose[None], jnp.zeros((1, 18)))
-            before = BipedState(previous_distance=jnp.float32(previous))
-            world: Any = SimpleNamespace(goal=jnp.array(goal, jnp.float32), task=before)
-            return task.judge(world, view, scene)
+    def one(task: Task, pose: jax.Array, goal: jax.Array, previous: jax.Array) -> Outcome:
+        view = base.make_view(scene, dynamics, pose[None], jnp.zeros((1, 18)))
+        before = BipedState(previous_distance=previous)
+        world: Any = SimpleNamespace(goal=goal, task=before)
+        return task.judge(world, view, scene)
 
-        outcome = jax.jit(jax.vmap(one))(jnp.asarray(np.array(qpos), jnp.float32))
-        return jax.tree.map(np.asarray, outcome)
+    def run(task: Any, qpos: Any, goal: Any = (1.0, 0.0), previous: float = 0.0) -> Outcome:
+        key = (task.name, task._config)
+        if key not in compiled:
+            compiled[key] = jax.jit(jax.vmap(functools.partial(one, task), (0, None, None)))
+        poses = np.array(qpos, np.float32)
+        filled = np.concatenate([poses, np.repeat(poses[-1:], BATCH - len(poses), axis=0)])
+        outcome = compiled[key](filled, np.array(goal, np.float32), np.float32(previous))
+        return jax.tree.map(lambda leaf: np.asarray(leaf)[: len(poses)], outcome)
 
     return run
