@@ -33,8 +33,10 @@ ALLOWED: dict[str, set[str]] = {
     "training": ACTING | {"evaluation", "replay"},
     "deploy": ACTING | {"evaluation", "figures"},
     "figures": set(),
+    "sweep": BASE | {"training", "figures"},
     "bench": ACTING | {"evaluation", "replay", "training", "deploy", "figures"},
-    "commands": ACTING | {"evaluation", "replay", "training", "deploy", "figures", "bench"},
+    "commands": ACTING
+    | {"evaluation", "replay", "training", "deploy", "figures", "sweep", "bench"},
 }
 """What each part may import of ours, besides itself; ``cli`` and the package root: everything."""
 

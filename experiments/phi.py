@@ -1,0 +1,46 @@
+"""How much source data: phi in {0, 0.25, 0.5, 0.75}, adapting to the dynamics shifts.
+
+The paper runs its ablations as adaptation with 100k transitions, in several target environments.
+"""
+
+TASKS = {"biped": {"task": "biped"}, "hurdles": {"task": "hurdles"}}
+SHIFTS = {name: {"shift": name} for name in ("bumpy", "icy", "weakened", "sloped", "gravity")}
+PHI = {f"phi{phi:g}": {"replay.phi": phi} for phi in (0.0, 0.25, 0.5, 0.75)}
+
+GRID = (
+    {
+        "preset": "paper",
+        "seeds": (0, 1, 2),
+        "base": {"variant": "twirl", "total_env_steps": 100_000, "eval.every": 5000},
+        "axes": {"task": TASKS, "shift": SHIFTS, "phi": PHI},
+    },
+)
+
+REDUCED = (
+    {
+        "preset": "cpu",
+        "seeds": (0, 1),
+        "base": {
+            "variant": "twirl",
+            "total_env_steps": 19_200,
+            "warmup_env_steps": 800,
+            "epoch_env_steps": 1600,
+            "env.num_envs": 32,
+            "droq.utd": 1.0,
+            "eval.every": 3200,
+            "eval.episodes": 16,
+            "eval.final_episodes": 32,
+        },
+        "nominal": {"seed": 0},
+        "axes": {
+            "task": {"biped": {"task": "biped"}},
+            "shift": {"icy": {"shift": "icy"}},
+            "phi": PHI,
+        },
+    },
+)
+
+REDUCED_NOTE = (
+    "biped on ice only (of 2 tasks x 5 shifts), 19k of 100k transitions, UTD 1 of 20, networks "
+    "2 x 128 of 2 x 256, 2 of 3 seeds that share one nominal run, 32 of 100 final episodes"
+)

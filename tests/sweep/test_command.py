@@ -1,0 +1,146 @@
+"""``twirl sweep``: the dry run, the estimates, the plain display and the exit status."""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from twirl_mjx.commands import sweep
+from twirl_mjx.sweep import estimate
+from twirl_mjx.sweep.grid import load
+from twirl_mjx.sweep.plan import make_plan
+from twirl_mjx.sweep.scheduler import Progress
+from twirl_mjx.sweep.table import SweepView
+
+Finish = Callable[..., Path]
+
+
+def dry_run(capsys: pytest.CaptureFixture[str], grid_file: Path, *more: str) -> str:
+    runs = str(grid_file.parent / "runs")
+    assert sweep.main([str(grid_file), "--dry-run", "--runs", runs, *more]) == 0
+    return capsys.readouterr().out
+
+
+def test_dry_run_lists_cells_with_status_and_time(
+    grid_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], finish_run: Finish
+) -> None:
+    out = dry_run(capsys, grid_file)
+    for cell in ("first: stand s0", "biped-phi0.25 s0", "biped-phi0.5 s1", "biped-zs s0"):
+        assert cell in out
+    assert out.count("missing") == 6
+    assert "6 runs to do" in out
+    assert "6 default" in out
+    cells = make_plan(load(str(grid_file)), tmp_path / "runs")
+    for cell in cells[:3]:
+        finish_run(cell, tmp_path / "runs")
+    out = dry_run(capsys, grid_file, "--workers", "2")
+    assert "first: stand" not in out  # finished, and no cell of the grid
+    assert out.count("finished") == 2
+    assert "3 runs to do" in out
+    assert "with 2 workers" in out
+    assert not list((tmp_path / "runs").glob("*/sweep.log"))
+
+
+def test_dry_run_of_chosen_arms_and_seeds(
+    grid_file: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = dry_run(capsys, grid_file, "--arms", "*phi0.5", "--seeds", "4")
+    assert "biped-phi0.5 s4" in out
+    assert "phi0.25" not in out
+    with pytest.raises(ValueError, match=r"no arm matches 'x'; arms: biped-phi0.25, biped-phi0.5"):
+        sweep.main([str(grid_file), "--arms", "x"])
+
+
+def test_estimates_use_what_was_measured(
+    grid_file: Path, tmp_path: Path, finish_run: Finish
+) -> None:
+    runs = tmp_path / "runs"
+    _, cell, other, *_, zero_shot = make_plan(load(str(grid_file)), runs)
+    base = estimate.START_S + cell.config.replay.source_size / estimate.ENV_STEPS_PER_S
+    steps, utd = cell.config.total_env_steps, cell.config.droq.utd
+    default = estimate.estimate(cell, runs, estimate.measure(runs))
+    rate = estimate.default_rate(cell.config)
+    assert default.basis == "default"
+    assert default.seconds == pytest.approx(base + steps / 5000 + steps * utd / rate)
+    finish_run(cell, runs)  # 8 transitions and 4 updates per second
+    measured = estimate.estimate(other, runs, estimate.measure(runs))
+    assert measured == (pytest.approx(base + steps / 8), "measured")
+    droq = dataclasses.replace(other.config.droq, utd=2.0)
+    scaled = dataclasses.replace(other, config=dataclasses.replace(other.config, droq=droq))
+    expected = base + steps / 5000 + steps * 2 / 4
+    assert estimate.estimate(scaled, runs, estimate.measure(runs)) == (
+        pytest.approx(expected), "scaled",
+    )  # fmt: skip
+    assert estimate.estimate(zero_shot, runs, []).seconds == estimate.START_S
+
+
+def test_default_rates_by_width(grid_file: Path, tmp_path: Path) -> None:
+    config = make_plan(load(str(grid_file)), tmp_path)[0].config
+
+    def rate(width: int) -> float:
+        droq = dataclasses.replace(config.droq, hidden_sizes=(width, width))
+        return estimate.default_rate(dataclasses.replace(config, droq=droq))
+
+    assert [rate(w) for w in (32, 128, 256, 512)] == [400, 400, 250, 62.5]
+
+
+def test_plain_lines_and_report(
+    grid_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    cells = make_plan(load(str(grid_file)), tmp_path)
+    jobs = [sweep.job_of(cell, tmp_path) for cell in cells]
+    table = {job.name: Progress(job) for job in jobs}
+    times = {cell.name: estimate.Estimate(60.0, "default") for cell in cells}
+    out = io.StringIO()
+    with SweepView(Console(file=out, width=200), "phi", cells, tmp_path, times) as view:
+        view.update(table)
+        assert out.getvalue() == ""
+        first, second, third, *_ = table.values()
+        first.state, first.attempts, first.seconds = "done", 1, 61.0
+        second.state, second.attempts, second.reason = "failed", 2, "exit status 1"
+        third.state, third.reason = "blocked", "needs x"
+        view.update(table)
+        view.update(table)
+    lines = out.getvalue().splitlines()
+    assert len(lines) == 3
+    assert lines[0].startswith("done     first: stand s0 | 0:01:01 | ")
+    assert "failed   biped-phi0.25 s0 | attempt 2 | exit status 1" in lines[1]
+    for progress in list(table.values())[3:]:
+        progress.state = "done"
+    assert sweep.report(table) == 1
+    said = capsys.readouterr().out
+    assert f"failed: {jobs[1].name}: exit status 1; log: {jobs[1].log}" in said
+    assert "blocked" in said
+    second.state = third.state = "stopped"
+    assert sweep.report(table) == 130
+    second.state = third.state = "done"
+    assert sweep.report(table) == 0
+
+
+def test_the_live_table_shows_running_cells(grid_file: Path, tmp_path: Path) -> None:
+    cells = make_plan(load(str(grid_file)), tmp_path)
+    table = {cell.name: Progress(sweep.job_of(cell, tmp_path)) for cell in cells}
+    times = {cell.name: estimate.Estimate(60.0, "default") for cell in cells}
+    running = list(table.values())[1]
+    running.state, running.attempts, running.began = "running", 2, 0.0
+    out = io.StringIO()
+    console = Console(file=out, width=200, force_terminal=True, legacy_windows=False)
+    with SweepView(console, "phi", cells, tmp_path, times) as view:
+        view.update(table)
+    text = out.getvalue()
+    assert "running (attempt 2)" in text
+    assert "0 / 96 (0 %)" in text
+    assert "phi: 0 of 6 done" in text
+
+
+def test_a_job_is_the_command_a_user_could_type(grid_file: Path, tmp_path: Path) -> None:
+    cell = make_plan(load(str(grid_file)), tmp_path)[1]
+    job = sweep.job_of(cell, tmp_path)
+    assert job.argv[:5] == ("-m", "twirl_mjx", "train", "--preset", "debug")
+    assert job.log == str(tmp_path / cell.name / "sweep.log")
+    assert job.needs == cell.needs != ()

@@ -1,0 +1,179 @@
+"""``twirl sweep``."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from fnmatch import fnmatch
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from rich.console import Console
+
+from twirl_mjx.commands.options import parse, say
+from twirl_mjx.config import check_range
+from twirl_mjx.sweep import estimate, gather, plan
+from twirl_mjx.sweep.grid import Grid, grids_folder, load
+from twirl_mjx.sweep.scheduler import Progress, RayExecutor, run_all, stop_on_signal
+from twirl_mjx.sweep.table import SweepView, plan_table
+from twirl_mjx.sweep.worker import Job
+from twirl_mjx.training.progress import format_seconds
+
+
+@dataclasses.dataclass(frozen=True)
+class SweepOptions:
+    """Run what is missing of a grid, resume what was cut off, and write its tables."""
+
+    grid: Annotated[str, tyro.conf.Positional]
+    """Module in experiments/ (tasks, shifts, phi, utd), or the path of a grid file."""
+    reduced: bool = False
+    """Take the smaller form, sized for two CPU cores."""
+    dry_run: bool = False
+    """List the cells with their status and an estimate of the time; run nothing."""
+    seeds: tuple[int, ...] = ()
+    """Seeds instead of the grid's."""
+    arms: str = "*"
+    """Only arms that match, for example 'biped-*'."""
+    nominal: tuple[Path, ...] = ()
+    """Finished nominal runs that adaptation starts from, one per task; the grid's by default."""
+    runs: Path = Path("runs")
+    """Folder of all runs; on a cluster one that all machines share."""
+    results: Path | None = None
+    """Folder of the tables; experiments/results by default."""
+    gather_only: bool = False
+    """Only write the tables of what is finished."""
+    workers: int | None = None
+    """Most runs at once; one per usable core, or per GPU fraction, by default."""
+    gpus: float | None = None
+    """GPUs per run, may be a fraction; one where there are any by default."""
+    address: str | None = None
+    """Join this Ray cluster ('auto' for the one of this machine) instead of starting Ray."""
+    retries: int = 1
+    """Further attempts after a crash; each goes on from the last checkpoint."""
+
+
+def main(argv: list[str]) -> int:
+    """Sweep; exit status 1 when a cell failed, 130 when stopped by a signal after saving."""
+    options = parse(SweepOptions, argv, "twirl sweep")
+    check_range("retries", options.retries, 0, 100)
+    if options.workers is not None:
+        check_range("workers", options.workers, 1, 10_000)
+    grid = load(options.grid, reduced=options.reduced, seeds=options.seeds or None)
+    grid = only_arms(grid, options.arms)
+    runs = options.runs.resolve()
+    cells = plan.make_plan(grid, runs, options.nominal)
+    status = {cell.name: plan.status_of(cell, runs) for cell in cells}
+    todo = wanted(cells, status)
+    speeds = estimate.measure(runs)
+    estimates = {cell.name: estimate.estimate(cell, runs, speeds) for cell in todo}
+    console = Console()
+    title = f"{grid.results_name}: {sum(1 for c in cells if c.arm)} cells"
+    code = 0
+    if options.dry_run:
+        shown = [c for c in cells if c.arm or c in todo]
+        if not console.is_terminal:
+            console.width = 400
+        console.print(plan_table(title, shown, status, estimates))
+        say(total_line(todo, estimates, options))
+        return 0
+    if todo and not options.gather_only:
+        say(total_line(todo, estimates, options))
+        with SweepView(console, title, todo, runs, estimates) as view:
+            table = _run(todo, runs, options, view)
+        code = report(table)
+    results = options.results or grids_folder() / "results"
+    written = gather.gather(grid, cells, runs, results)
+    finished = sum(1 for c in cells if c.arm and plan.is_finished(c, runs))
+    say(
+        f"{grid.results_name}: {finished} of {sum(1 for c in cells if c.arm)} cells finished;"
+        f" {len(written)} tables in {results / grid.results_name}"
+    )
+    return code
+
+
+def only_arms(grid: Grid, pattern: str) -> Grid:
+    """Return the grid with the arms that match a shell pattern.
+
+    Raises:
+        ValueError: None does; the message lists all.
+    """
+    kept = tuple(draft for draft in grid.drafts if fnmatch(draft.arm, pattern))
+    if not kept:
+        arms = ", ".join(dict.fromkeys(draft.arm for draft in grid.drafts))
+        raise ValueError(f"no arm matches {pattern!r}; arms: {arms}")
+    return dataclasses.replace(grid, drafts=kept)
+
+
+def wanted(cells: Sequence[plan.Cell], status: Mapping[str, str]) -> list[plan.Cell]:
+    """Return the cells that are not finished, and of the runs they need those that are not.
+
+    What others need comes first.
+    """
+    by_name = {cell.name: cell for cell in cells}
+    names: set[str] = set()
+
+    def want(cell: plan.Cell) -> None:
+        if status[cell.name] != "finished" and cell.name not in names:
+            names.add(cell.name)
+            for need in cell.needs:
+                want(by_name[need])
+
+    for cell in cells:
+        if cell.arm:
+            want(cell)
+    missing = [cell for cell in cells if cell.name in names]
+    needed = {need for cell in missing for need in cell.needs}
+    return sorted(missing, key=lambda cell: cell.name not in needed)
+
+
+def total_line(
+    todo: Sequence[plan.Cell], estimates: Mapping[str, estimate.Estimate], options: SweepOptions
+) -> str:
+    """Return the expected time of all missing cells in words."""
+    seconds = sum(e.seconds for e in estimates.values())
+    per = (
+        f", {format_seconds(seconds / options.workers)} with {options.workers} workers"
+        if (options.workers)
+        else ""
+    )
+    bases = ", ".join(
+        f"{sum(e.basis == basis for e in estimates.values())} {basis}"
+        for basis in ("measured", "scaled", "default")
+        if any(e.basis == basis for e in estimates.values())
+    )
+    return (
+        f"{len(todo)} runs to do: about {format_seconds(seconds)} (h:mm:ss) of work on single"
+        f" cores{per} (estimates: {bases or 'none needed'})"
+    )
+
+
+def _run(
+    todo: Sequence[plan.Cell], runs: Path, options: SweepOptions, view: SweepView
+) -> dict[str, Progress]:
+    jobs = [job_of(cell, runs) for cell in todo]
+    with (
+        stop_on_signal() as stop,
+        RayExecutor(
+            address=options.address, workers=options.workers, gpus=options.gpus
+        ) as executor,
+    ):
+        return run_all(jobs, executor, retries=options.retries, stop=stop, show=view.update)
+
+
+def job_of(cell: plan.Cell, runs: Path) -> Job:
+    """Return the job that trains a cell: this program in a process of its own."""
+    argv = ("-m", "twirl_mjx", *plan.arguments(cell, runs))
+    return Job(cell.name, argv, str(runs / cell.name / "sweep.log"), cell.needs)
+
+
+def report(table: Mapping[str, Progress]) -> int:
+    """Say what did not finish and where its output is; return the exit status."""
+    lost = [p for p in table.values() if p.state in ("failed", "blocked")]
+    stopped = [p for p in table.values() if p.state in ("stopped", "waiting", "running")]
+    for progress in lost:
+        say(f"{progress.state}: {progress.job.name}: {progress.reason}; log: {progress.job.log}")
+    if stopped:
+        say(f"stopped with {len(stopped)} runs to do; the same command goes on")
+        return 130
+    return 1 if lost else 0

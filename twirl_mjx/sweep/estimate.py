@@ -1,0 +1,102 @@
+"""How long cells take: from finished runs of this machine, else from stated defaults."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import statistics
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+from twirl_mjx.config import TrainConfig
+from twirl_mjx.sweep.plan import METRICS_CSV, Cell, reached_steps
+from twirl_mjx.training import rundir
+
+START_S = 45.0
+"""Start of a run: imports, cached programs, evaluations (measured on one busy core)."""
+ENV_STEPS_PER_S = 5000.0
+"""Transitions per second of the native engine on one core, without learning."""
+UPDATES_PER_S = {128: 400.0, 256: 250.0}
+"""Critic updates per second on one core by layer width; wider layers scale with the square."""
+
+
+class Estimate(NamedTuple):
+    """Expected time of a cell on one worker."""
+
+    seconds: float
+    """s."""
+    basis: str
+    """``measured`` (the same settings), ``scaled`` (the same learner) or ``default``."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Speed:
+    """What a run has measured."""
+
+    learner: tuple[object, ...]
+    """Settings that decide the cost of an update."""
+    setting: tuple[object, ...]
+    """Settings that decide the cost of a transition."""
+    env_steps_per_s: float
+    """Transitions per second, learning included."""
+    updates_per_s: float
+    """Critic updates per second, the worlds included."""
+
+
+def measure(runs: Path) -> list[Speed]:
+    """Return the median speeds of all runs below a folder that have measured any."""
+    speeds = []
+    for path in sorted(runs.glob(f"*/{METRICS_CSV}")):
+        try:
+            config = rundir.read_config(path.parent)
+        except (FileNotFoundError, ValueError):
+            continue  # not a run of this version: it tells nothing about these
+        rates = _rates(path)
+        if rates is not None:
+            speeds.append(Speed(_learner(config), _setting(config), *rates))
+    return speeds
+
+
+def _rates(path: Path) -> tuple[float, float] | None:
+    values: dict[str, list[float]] = {"env_steps_per_s": [], "updates_per_s": []}
+    with path.open(newline="") as file:
+        for row in csv.DictReader(file):
+            if row["metric"] in values and row["grad_steps"] not in ("", "0"):
+                values[row["metric"]].append(float(row["value"]))
+    medians = [statistics.median(v) if v else 0.0 for v in values.values()]
+    return (medians[0], medians[1]) if min(medians) > 0.0 else None
+
+
+def _learner(config: TrainConfig) -> tuple[object, ...]:
+    droq = config.droq
+    return (droq.hidden_sizes, droq.num_critics, droq.batch_size, droq.matmul_dtype, droq.fast)
+
+
+def _setting(config: TrainConfig) -> tuple[object, ...]:
+    droq, env = config.droq, config.env
+    return (config.task, env.num_envs, env.engine, droq.utd, droq.updates_per_block)
+
+
+def estimate(cell: Cell, runs: Path, speeds: Sequence[Speed]) -> Estimate:
+    """Return the time a cell still needs on one worker."""
+    config = cell.config
+    if config.variant == "zero-shot":
+        return Estimate(START_S, "default")
+    steps = max(0, config.total_env_steps - reached_steps(runs / cell.name))
+    alike = [s for s in speeds if s.learner == _learner(config)]
+    same = [s.env_steps_per_s for s in alike if s.setting == _setting(config)]
+    collecting = config.replay.source_size if config.uses_source_data and not cell.is_shifted else 0
+    fixed = START_S + collecting / ENV_STEPS_PER_S
+    if same:
+        return Estimate(fixed + steps / statistics.median(same), "measured")
+    rate = statistics.median(s.updates_per_s for s in alike) if alike else default_rate(config)
+    seconds = fixed + steps / ENV_STEPS_PER_S + steps * config.droq.utd / rate
+    return Estimate(seconds, "scaled" if alike else "default")
+
+
+def default_rate(config: TrainConfig) -> float:
+    """Return critic updates per second of one core where nothing was measured."""
+    width = max(config.droq.hidden_sizes)
+    nearest = min((w for w in UPDATES_PER_S if w >= width), default=max(UPDATES_PER_S))
+    return UPDATES_PER_S[nearest] * min(1.0, (nearest / width) ** 2)

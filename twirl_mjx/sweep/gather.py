@@ -1,0 +1,152 @@
+"""From finished runs to the committed tables: ``experiments/results/<grid>/<arm>.csv``.
+
+Per arm a curve table (main metrics, at most ``MAX_POINTS`` rows each) and an episode table,
+with comment lines that say what was reduced and which command makes the rows again.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Sequence
+from pathlib import Path
+
+from twirl_mjx.figures.style import METRICS
+from twirl_mjx.figures.tables import CURVE_COLUMNS, EPISODE_COLUMNS
+from twirl_mjx.sweep.grid import Grid
+from twirl_mjx.sweep.plan import EVAL_CSV, METRICS_CSV, Cell, is_finished
+
+MAX_POINTS = 100
+"""Most rows of one metric of one run."""
+EVALUATION = "eval/"
+SETTING_COLUMNS = {"phi": "replay.phi", "utd": "droq.utd"}
+"""Column -> config field; a table has the columns whose field varies in the grid."""
+
+Row = dict[str, str]
+
+
+def gather(grid: Grid, cells: Sequence[Cell], runs: Path, results: Path) -> list[Path]:
+    """Write the tables of every arm with a finished run; drop those of arms that are gone.
+
+    Args:
+        grid: The grid.
+        cells: Its plan.
+        runs: Folder of all runs.
+        results: ``experiments/results``; the tables go into a folder of the grid in it.
+
+    Returns:
+        The files written.
+    """
+    folder = results / grid.results_name
+    written = []
+    columns = tuple(c for c, field in SETTING_COLUMNS.items() if field in grid.varied)
+    arms = dict.fromkeys(cell.arm for cell in cells if cell.arm)
+    for arm in arms:
+        mine = [cell for cell in cells if cell.arm == arm]
+        finished = [cell for cell in mine if is_finished(cell, runs)]
+        if not finished:
+            continue
+        notes = notes_of(grid, len(finished), len(mine))
+        curves = [row for cell in finished for row in curve_rows(cell, runs, columns)]
+        episodes = [row for cell in finished for row in episode_rows(cell, runs, columns)]
+        for suffix, header, rows in (
+            ("", CURVE_COLUMNS, curves),
+            (".episodes", EPISODE_COLUMNS, episodes),
+        ):
+            path = folder / f"{arm}{suffix}.csv"
+            write_table(path, notes, (*header, *columns), rows)
+            written.append(path)
+    for path in stale_tables(folder, grid, set(arms)):
+        path.unlink()
+    return written
+
+
+def notes_of(grid: Grid, finished: int, expected: int) -> list[str]:
+    """Return the comment lines of a table."""
+    more = ' ARGS="--reduced"' if grid.reduced else ""
+    lines = [f"# reduced: {grid.note}"] if grid.reduced else []
+    lines += [f"# command: make sweep GRID={grid.name}{more}", f"# grid: {grid.results_name}"]
+    if finished < expected:
+        lines.append(f"# incomplete: {finished} of {expected} seeds")
+    return lines
+
+
+def stale_tables(folder: Path, grid: Grid, arms: set[str]) -> list[Path]:
+    """Return tables this grid has written for arms that it no longer has."""
+    mark = f"# grid: {grid.results_name}\n"
+    return [
+        path
+        for path in sorted(folder.glob("*.csv"))
+        if path.name.removesuffix(".csv").removesuffix(".episodes") not in arms
+        and mark in path.read_text(encoding="utf-8")[:2000]
+    ]
+
+
+def curve_rows(cell: Cell, runs: Path, columns: Sequence[str]) -> list[Row]:
+    """Return the main metrics of a run; those of the evaluation at 0 where nothing was trained."""
+    path = runs / cell.name / METRICS_CSV
+    if cell.config.variant == "zero-shot" or not path.is_file():
+        return _untrained_rows(cell, runs, columns)
+    series: dict[str, list[Row]] = {}
+    with path.open(newline="") as file:
+        for row in csv.DictReader(file):
+            name = row["metric"]
+            if name.removeprefix(EVALUATION) in METRICS:
+                series.setdefault(name, []).append(row | _settings(cell, columns))
+    return [row for rows in series.values() for row in thin(rows)]
+
+
+def _untrained_rows(cell: Cell, runs: Path, columns: Sequence[str]) -> list[Row]:
+    values: dict[str, list[float]] = {}
+    rows = episode_rows(cell, runs, columns)
+    for row in rows:
+        values.setdefault(row["metric"], []).append(float(row["value"]))
+    return [
+        {c: rows[0][c] for c in (*EPISODE_COLUMNS[:5], *columns)}
+        | {"metric": EVALUATION + name, "env_steps": "0", "grad_steps": "0", "wall_s": "0"}
+        | {"value": f"{sum(column) / len(column):.6g}"}
+        for name, column in values.items()
+    ]
+
+
+def episode_rows(cell: Cell, runs: Path, columns: Sequence[str]) -> list[Row]:
+    """Return the main metrics of every episode of a run's final evaluation."""
+    with (runs / cell.name / EVAL_CSV).open(newline="") as file:
+        return [
+            row | _settings(cell, columns)
+            for row in csv.DictReader(file)
+            if row["metric"] in METRICS
+        ]
+
+
+def _settings(cell: Cell, columns: Sequence[str]) -> Row:
+    values = {"phi": cell.config.effective_phi, "utd": cell.config.droq.utd}
+    trained = cell.config.variant != "zero-shot"
+    return {column: f"{values[column]:g}" if trained else "" for column in columns}
+
+
+def thin(rows: Sequence[Row], points: int = MAX_POINTS) -> list[Row]:
+    """Return at most ``points`` rows, evenly spread, the first and the last among them."""
+    if len(rows) <= points:
+        return list(rows)
+    last = len(rows) - 1
+    return [rows[round(i * last / (points - 1))] for i in range(points)]
+
+
+def write_table(
+    path: Path, notes: Sequence[str], columns: Sequence[str], rows: Sequence[Row]
+) -> None:
+    """Write comment lines and rows, whole or not at all; numbers with six digits."""
+    text = io.StringIO()
+    text.write("".join(f"{line}\n" for line in notes))
+    writer = csv.DictWriter(text, columns, lineterminator="\n", extrasaction="ignore")
+    writer.writeheader()
+    for row in rows:
+        short = {"value": f"{float(row['value']):.6g}"}
+        if "wall_s" in row:
+            short["wall_s"] = f"{float(row['wall_s']):.1f}"
+        writer.writerow(row | short)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(path.name + ".partial")
+    partial.write_text(text.getvalue(), encoding="utf-8")
+    partial.replace(path)

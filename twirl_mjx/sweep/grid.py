@@ -1,0 +1,190 @@
+"""Grids: plain data in ``experiments/*.py``, checked here and expanded into resolved configs.
+
+A grid module holds ``GRID`` and ``REDUCED`` (a smaller form), each a tuple of *blocks*, and
+``REDUCED_NOTE``. A block is a dict: ``preset``, ``seeds``, ``axes`` (axis -> label -> settings by
+dotted config field), and optionally ``base`` (settings of every cell) and ``nominal`` (settings of
+the run that adaptation starts from). Its cells are the product of all axes and seeds; the labels
+joined by ``-`` name the *arm*, which is a cell without its seed.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib.util
+import itertools
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from twirl_mjx import config_json
+from twirl_mjx.config import TrainConfig, check_choice
+from twirl_mjx.presets import PRESETS, make_config
+
+BLOCK_KEYS = ("preset", "seeds", "axes", "base", "nominal")
+"""What a block may hold; the first three are needed."""
+
+Settings = Mapping[str, Any]
+"""Dotted config field -> value."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Draft:
+    """One cell as the grid states it; where its source comes from is not resolved yet."""
+
+    arm: str
+    """Labels of its axes, joined; the cell without its seed."""
+    preset: str
+    """Preset the config came from."""
+    config: TrainConfig
+    """The run, every field resolved but ``source``."""
+    nominal: tuple[tuple[str, Any], ...]
+    """Settings of the nominal run on top of its preset; only used under a shift."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Grid:
+    """An expanded grid."""
+
+    name: str
+    """Name of the module, ``phi`` for ``experiments/phi.py``."""
+    reduced: bool
+    """Whether this is the smaller form."""
+    note: str
+    """What was reduced; empty for the full form."""
+    drafts: tuple[Draft, ...]
+    """Its cells, arms in order, seeds innermost."""
+    varied: frozenset[str]
+    """Dotted fields that an axis sets."""
+
+    @property
+    def results_name(self) -> str:
+        """Folder of its tables: the two forms never share one."""
+        return f"{self.name}_reduced" if self.reduced else self.name
+
+
+def grids_folder() -> Path:
+    """Return ``experiments/`` of the working directory, else of the checkout this code is in."""
+    here = Path("experiments")
+    return here if here.is_dir() else Path(__file__).resolve().parents[2] / "experiments"
+
+
+def load(name: str, *, reduced: bool = False, seeds: Sequence[int] | None = None) -> Grid:
+    """Read a grid.
+
+    Args:
+        name: Name of a module in ``experiments/``, or the path of a grid file.
+        reduced: Take the smaller form.
+        seeds: Seeds instead of the grid's; blocks with a single seed keep theirs.
+
+    Raises:
+        ValueError: No such grid (with the nearest name), or its data are not valid; the message
+            names the block and the entry.
+    """
+    path = Path(name)
+    if path.suffix != ".py":
+        known = tuple(sorted(p.stem for p in grids_folder().glob("*.py")))
+        if not known:
+            raise ValueError(f"no grids in {grids_folder().resolve()}: run from a checkout")
+        check_choice("grid", name, known)
+        path = grids_folder() / f"{name}.py"
+    module = _module(path)
+    form = "REDUCED" if reduced else "GRID"
+    blocks = getattr(module, form, None)
+    if not isinstance(blocks, tuple) or not blocks:
+        raise ValueError(f"{path}: {form} is {blocks!r}, expected a tuple of blocks")
+    drafts: list[Draft] = []
+    for number, block in enumerate(blocks):
+        drafts += expand(block, f"{path.name}: {form}[{number}]", seeds)
+    check_unique(drafts, f"{path.name}: {form}")
+    varied = frozenset(
+        field for block in blocks for axis in block["axes"].values() for s in axis.values()
+        for field in s
+    )  # fmt: skip
+    note = str(getattr(module, "REDUCED_NOTE", "smaller budgets")) if reduced else ""
+    return Grid(path.stem, reduced, note, tuple(drafts), varied)
+
+
+def _module(path: Path) -> ModuleType:
+    if not path.is_file():
+        raise ValueError(f"no grid file {path}; grids: {', '.join(_names())}")
+    spec = importlib.util.spec_from_file_location(f"_twirl_grid_{path.stem}", path)
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def _names() -> list[str]:
+    return sorted(p.stem for p in grids_folder().glob("*.py"))
+
+
+def expand(block: Mapping[str, Any], where: str, seeds: Sequence[int] | None) -> list[Draft]:
+    """Return the cells of a block: the product of its axes, each with every seed.
+
+    Raises:
+        ValueError: A missing or unknown key, no seeds, or a setting no config has.
+    """
+    for key in block:
+        check_choice(f"key in {where}", key, BLOCK_KEYS)
+    for key in BLOCK_KEYS[:3]:
+        if key not in block:
+            raise ValueError(f"{where} has no {key!r}, it needs {', '.join(BLOCK_KEYS[:3])}")
+    check_choice(f"preset in {where}", block["preset"], PRESETS)
+    own = tuple(block["seeds"])
+    chosen = own if seeds is None or len(own) == 1 else tuple(seeds)
+    if not chosen or not block["axes"]:
+        raise ValueError(f"{where} has no cells: seeds {chosen}, axes {list(block['axes'])}")
+    nominal = tuple(sorted(block.get("nominal", {}).items()))
+    drafts = []
+    for choice in itertools.product(*(axis.items() for axis in block["axes"].values())):
+        arm = "-".join(label for label, _ in choice)
+        settings = dict(block.get("base", {}))
+        for _, more in choice:
+            settings |= more
+        for seed in chosen:
+            config = configure(block["preset"], settings | {"seed": seed}, f"{where}, arm {arm}")
+            drafts.append(Draft(arm, block["preset"], config, nominal))
+    return drafts
+
+
+def configure(preset: str, settings: Settings, where: str) -> TrainConfig:
+    """Return a preset's config of ``settings["task"]`` with all settings applied at once.
+
+    Raises:
+        ValueError: An unknown field (with the nearest), or a value out of range.
+    """
+    if "task" not in settings:
+        raise ValueError(f"{where} has no 'task'")
+    try:
+        plain = dataclasses.asdict(make_config(settings["task"], preset))
+        for field, value in settings.items():
+            _assign(plain, field, value)
+        return config_json.from_dict(TrainConfig, plain)
+    except ValueError as error:
+        raise ValueError(f"{where}: {error}") from None
+
+
+def _assign(plain: dict[str, Any], field: str, value: Any) -> None:
+    """Set a dotted field of a config given as nested dicts."""
+    *parents, leaf = field.split(".")
+    node = plain
+    for parent in parents:
+        check_choice("config field", parent, tuple(k for k, v in node.items() if type(v) is dict))
+        node = node[parent]
+    check_choice("config field", leaf, tuple(node))
+    node[leaf] = value
+
+
+def check_unique(drafts: Sequence[Draft], where: str) -> None:
+    """Check that no two cells share arm and seed.
+
+    Raises:
+        ValueError: Naming the first that do.
+    """
+    seen = set()
+    for draft in drafts:
+        key = (draft.arm, draft.config.seed)
+        if key in seen:
+            raise ValueError(f"{where}: arm {draft.arm!r} with seed {key[1]} exists twice")
+        seen.add(key)

@@ -1,0 +1,264 @@
+"""From the cells of a grid to runs: identity, the runs they need first, and what is done already.
+
+The identity of a cell is the digest of its resolved config, in which ``source`` says what the
+source *is* (a policy file by its hash, a run by its own digest) and not where it lies. The digest
+is part of the run's name, so two grids that hold the same cell share one run, and a changed
+grid, preset or source never continues or counts the run of another.
+"""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import hashlib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Literal
+
+from twirl_mjx import config_json
+from twirl_mjx.assets import asset_path
+from twirl_mjx.config import SOURCE_OF, TrainConfig
+from twirl_mjx.presets import make_config
+from twirl_mjx.sweep.grid import Draft, Grid, configure
+from twirl_mjx.training import rundir
+
+EVAL_CSV = "eval.csv"
+METRICS_CSV = "metrics.csv"
+SCRIPTED = ("trot", "bound", "zero", "random")
+
+Status = Literal["finished", "in use", "cut off", "missing"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Cell:
+    """A run of the sweep: a cell of the grid, or a run that cells need first."""
+
+    name: str
+    """Name of the run."""
+    arm: str
+    """Arm of the grid; empty for a run that is only needed by others."""
+    preset: str
+    """Preset the config came from."""
+    config: TrainConfig
+    """The run, with ``source`` naming what the source is: this is the identity."""
+    source: str
+    """``--source`` of the run: where the source lies."""
+    needs: tuple[str, ...] = ()
+    """Names of the runs that have to be finished before."""
+
+    @property
+    def is_shifted(self) -> bool:
+        """Whether it adapts to a dynamics shift."""
+        return self.config.shift != "none"
+
+    @property
+    def label(self) -> str:
+        """Arm and seed, or the task and seed of a needed run."""
+        seed = f"s{self.config.seed}"
+        return f"{self.arm} {seed}" if self.arm else f"first: {self.config.task} {seed}"
+
+
+def make_plan(grid: Grid, runs: Path, nominal: Sequence[Path] = ()) -> tuple[Cell, ...]:
+    """Return all runs of a grid, each after those it needs.
+
+    Args:
+        grid: The grid.
+        runs: Folder of all runs.
+        nominal: Finished nominal runs to start adaptation from, at most one per task, instead
+            of those of the grid.
+
+    Raises:
+        ValueError: Two nominal runs of one task, or one that is not finished.
+    """
+    given = given_nominals(nominal)
+    cells: dict[str, Cell] = {}
+    for draft in grid.drafts:
+        resolve(draft, runs, given, cells)
+    return tuple(cells.values())
+
+
+def given_nominals(paths: Sequence[Path]) -> dict[str, Path]:
+    """Return task -> run directory of the nominal runs a user names.
+
+    Raises:
+        ValueError: Two of one task, one under a shift, or one that is not finished.
+    """
+    found: dict[str, Path] = {}
+    for path in paths:
+        config = rundir.read_config(path)
+        if config.shift != "none" or not (path / EVAL_CSV).is_file():
+            raise ValueError(f"{path} is not a finished run without a shift")
+        if config.task in found:
+            raise ValueError(
+                f"{found[config.task]} and {path} are both nominal runs of {config.task}"
+            )
+        found[config.task] = path
+    return found
+
+
+def resolve(draft: Draft, runs: Path, given: Mapping[str, Path], cells: dict[str, Cell]) -> Cell:
+    """Add a draft's cell to ``cells``, after the runs it needs; return it."""
+    identity, place, needs = _source_of(draft, runs, given, cells)
+    config = dataclasses.replace(draft.config, source=identity)
+    name = run_name(config)
+    if not draft.arm and (adopted := _adoptable(draft, runs)):
+        name = adopted
+    if name in cells and cells[name].arm:
+        return cells[name]
+    cell = Cell(name, draft.arm, draft.preset, config, place, needs)
+    cells[name] = cell
+    return cell
+
+
+def _source_of(
+    draft: Draft, runs: Path, given: Mapping[str, Path], cells: dict[str, Cell]
+) -> tuple[str, str, tuple[str, ...]]:
+    """Return what the source is, where it lies, and the names of the runs needed for it."""
+    config = draft.config
+    if config.variant == "scratch":
+        return "auto", "auto", ()
+    if config.source in SCRIPTED:
+        return config.source, config.source, ()
+    if config.source not in ("auto", "train"):
+        path = Path(config.source)
+        return _identity_of_path(path), str(path.resolve()), ()
+    if config.shift != "none":
+        if config.task in given:
+            path = given[config.task]
+            return _identity_of_path(path), str(path.resolve()), ()
+        return _needed(_nominal_draft(draft), runs, given, cells)
+    task = SOURCE_OF[config.task]
+    shipped = _shipped(task)
+    if config.source == "auto" and draft.preset != "debug" and shipped is not None:
+        return _identity_of_path(shipped), "auto", ()
+    return _needed(Draft("", draft.preset, make_config(task, draft.preset), ()), runs, given, cells)
+
+
+def _needed(
+    draft: Draft, runs: Path, given: Mapping[str, Path], cells: dict[str, Cell]
+) -> tuple[str, str, tuple[str, ...]]:
+    cell = resolve(draft, runs, given, cells)
+    identity = f"run {rundir.digest(cell.config)}"
+    return identity, str((runs / cell.name).resolve()), (cell.name,)
+
+
+def _nominal_draft(draft: Draft) -> Draft:
+    """Return the run without a shift that an adaptation starts from: same task, preset, seed."""
+    task, seed = draft.config.task, draft.config.seed
+    settings = {"task": task, "seed": seed, "variant": "twirl"} | dict(draft.nominal)
+    config = configure(draft.preset, settings, f"nominal run of arm {draft.arm}")
+    return Draft("", draft.preset, config, ())
+
+
+def _adoptable(draft: Draft, runs: Path) -> str | None:
+    """Return the name under which ``twirl train`` has finished the same run, if it has."""
+    plain = make_config(draft.config.task, draft.preset)
+    same = dataclasses.replace(plain, seed=draft.config.seed, variant=draft.config.variant)
+    run_dir = runs / rundir.default_name(same, draft.preset)
+    if draft.config != same or not (run_dir / EVAL_CSV).is_file():
+        return None
+    found = rundir.read_config(run_dir)
+    differs = [
+        line
+        for line in config_json.diff(found, same)
+        if not line.startswith(("checkpoint_minutes", "eval.", "env.engine", "source"))
+    ]
+    return None if differs else run_dir.name
+
+
+def _shipped(task: str) -> Path | None:
+    try:
+        return asset_path("policies", f"{task}.npz")
+    except FileNotFoundError:
+        return None
+
+
+def _identity_of_path(path: Path) -> str:
+    """Return a text that changes with the content of a policy file or the config of a run."""
+    if path.is_dir():
+        steps = evaluated_steps(path)
+        return f"{path.name} {rundir.digest(rundir.read_config(path))} at {steps}"
+    if not path.is_file():
+        raise FileNotFoundError(f"no source policy {path}")
+    return f"{path.name} {hashlib.sha256(path.read_bytes()).hexdigest()[:12]}"
+
+
+def run_name(config: TrainConfig) -> str:
+    """Return the name of a cell's run; it ends in the digest of the resolved config."""
+    shift = "" if config.shift == "none" else f"-{config.shift}"
+    variant = config.variant.replace("+", "_")
+    return f"{config.task}{shift}-{variant}-s{config.seed}-{rundir.digest(config)[:8]}"
+
+
+def evaluated_steps(run_dir: Path) -> int | None:
+    """Return the transitions at which a run was closed by its final evaluation, None if not."""
+    path = run_dir / EVAL_CSV
+    if not path.is_file():
+        return None
+    with path.open(newline="") as file:
+        row = next(csv.DictReader(file), None)
+    return None if row is None else int(row["env_steps"])
+
+
+def reached_steps(run_dir: Path) -> int:
+    """Return the transitions of the last row of ``metrics.csv``, 0 without one."""
+    path = run_dir / METRICS_CSV
+    if not path.is_file():
+        return 0
+    with path.open("rb") as file:
+        file.seek(0, 2)
+        file.seek(max(0, file.tell() - 4096))
+        lines = file.read().decode(errors="replace").splitlines(keepends=True)
+    for line in reversed(lines):
+        cells = line.split(",")
+        if line.endswith("\n") and len(cells) == 10 and cells[6].isdigit():
+            return int(cells[6])
+    return 0
+
+
+def is_finished(cell: Cell, runs: Path) -> bool:
+    """Return whether the run of a cell is closed, at its budget, under the same config.
+
+    Raises:
+        ValueError: The directory of the cell holds another run.
+    """
+    run_dir = runs / cell.name
+    steps = evaluated_steps(run_dir)
+    if steps is None:
+        return False
+    if cell.name == run_name(cell.config):
+        found = dataclasses.replace(rundir.read_config(run_dir), source=cell.config.source)
+        if found != cell.config:
+            lines = "\n  ".join(config_json.diff(found, cell.config))
+            raise ValueError(f"{run_dir} was changed by hand (there -> cell):\n  {lines}")
+    return cell.config.variant == "zero-shot" or steps >= cell.config.total_env_steps
+
+
+def status_of(cell: Cell, runs: Path) -> Status:
+    """Return how far a cell is."""
+    run_dir = runs / cell.name
+    if is_finished(cell, runs):
+        return "finished"
+    if rundir.owner(run_dir) is not None:
+        return "in use"
+    return "cut off" if reached_steps(run_dir) else "missing"
+
+
+def arguments(cell: Cell, runs: Path) -> list[str]:
+    """Return the arguments of ``twirl`` that train (or resume) a cell."""
+    plain = config_json.flatten(make_config(cell.config.task, cell.preset))
+    wanted = config_json.flatten(dataclasses.replace(cell.config, source=cell.source))
+    argv = ["train", "--preset", cell.preset, "--task", cell.config.task]
+    argv += ["--name", cell.name, "--runs", str(runs)]
+    for field, value in wanted.items():
+        if value == plain[field] or field == "task":
+            continue
+        flag = field.replace("_", "-")
+        if isinstance(value, bool):
+            *parents, leaf = flag.split(".")
+            argv.append("--" + ".".join([*parents, leaf if value else f"no-{leaf}"]))
+        elif isinstance(value, tuple):
+            argv += [f"--{flag}", *map(str, value)]
+        else:
+            argv += [f"--{flag}", str(value)]
+    return argv

@@ -1,0 +1,267 @@
+"""Run jobs on Ray: dependencies, retries, and nothing that one crash could take with it."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import logging
+import math
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, Literal, Protocol
+
+from twirl_mjx.sweep.worker import Ending, Job, run_job
+
+State = Literal["waiting", "running", "done", "failed", "blocked", "stopped"]
+
+OBJECT_STORE_BYTES = 80 * 2**20
+"""Ray's smallest object store; jobs hand over a few words."""
+NO_RETRY = 2
+"""Exit status of unusable arguments: another attempt would end the same way."""
+STOPPED = 130
+"""Exit status of a run that was asked to stop and saved itself."""
+STOP_WAIT_S = 120.0
+"""Time for all running jobs to stop."""
+
+
+@dataclasses.dataclass
+class Progress:
+    """How far a job is."""
+
+    job: Job
+    state: State = "waiting"
+    attempts: int = 0
+    began: float = math.nan
+    """Monotonic time of the present attempt, s."""
+    seconds: float = 0.0
+    """Duration of the finished attempt, s."""
+    reason: str = ""
+    """Why it did not finish."""
+    where: str = ""
+    """Machine and core of the last attempt."""
+
+
+class Executor(Protocol):
+    """Something that runs jobs elsewhere."""
+
+    def capacity(self) -> int:
+        """Return how many jobs can run at once."""
+        ...
+
+    def submit(self, job: Job) -> Any:
+        """Start a job; return a handle."""
+        ...
+
+    def finished(self, handles: Sequence[Any], timeout_s: float) -> list[Any]:
+        """Wait up to ``timeout_s`` for handles whose job has ended, and return those."""
+        ...
+
+    def ending(self, handle: Any) -> Ending:
+        """Return how a job ended; raises when its worker was lost."""
+        ...
+
+    def stop(self, handle: Any) -> None:
+        """Ask a running job to save and stop."""
+        ...
+
+
+class RayExecutor:
+    """Jobs as Ray tasks; a context manager that starts and ends Ray."""
+
+    def __init__(self, *, address: str | None, workers: int | None, gpus: float | None) -> None:
+        """Start Ray on this machine, or join a cluster.
+
+        Args:
+            address: Address of a running Ray cluster; None starts Ray here, without server.
+            workers: Most jobs at once; None for one per core (or GPU fraction).
+            gpus: GPUs per job, may be a fraction; None for one where there are any, else 0.
+
+        Raises:
+            ValueError: More GPUs are asked for than there are.
+        """
+        import ray
+
+        self._ray = ray
+        options: dict[str, Any] = {"address": address}
+        if address is None:
+            options = {
+                "num_cpus": workers,
+                "include_dashboard": False,
+                "object_store_memory": OBJECT_STORE_BYTES,
+            }
+        ray.init(
+            log_to_driver=False, configure_logging=False, logging_level=logging.ERROR, **options
+        )
+        self._workers = workers
+        there = float(ray.cluster_resources().get("GPU", 0))
+        self._gpus = (1.0 if there else 0.0) if gpus is None else gpus
+        if self._gpus > there:
+            self.close()
+            raise ValueError(f"{self._gpus:g} GPUs per run asked for, {there:g} available")
+        self._task = ray.remote(run_job)
+        self._options: dict[str, Any] = {"num_cpus": 1, "num_gpus": self._gpus, "max_retries": 0}
+        if 0.0 < self._gpus < 1.0:  # jobs that share a GPU may only claim their part of it
+            part = {"XLA_PYTHON_CLIENT_MEM_FRACTION": f"{0.9 * self._gpus:.3f}"}
+            self._options["runtime_env"] = {"env_vars": part}
+
+    def __enter__(self) -> RayExecutor:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End Ray (leave the cluster)."""
+        self._ray.shutdown()
+
+    def capacity(self) -> int:
+        """Return how many jobs the cluster has room for."""
+        resources = self._ray.cluster_resources()
+        room = int(resources.get("CPU", 0))
+        if self._gpus:
+            room = min(room, int(resources.get("GPU", 0) / self._gpus + 1e-9))
+        return min(room, self._workers or room)
+
+    def submit(self, job: Job) -> Any:
+        """Start a job as a task of its own worker process."""
+        return self._task.options(name=job.name, **self._options).remote(job, pin=not self._gpus)
+
+    def finished(self, handles: Sequence[Any], timeout_s: float) -> list[Any]:
+        """Wait for endings."""
+        done, _ = self._ray.wait(
+            list(handles), num_returns=len(handles), timeout=timeout_s, fetch_local=False
+        )
+        return done
+
+    def ending(self, handle: Any) -> Ending:
+        """Return how a task ended."""
+        return self._ray.get(handle)
+
+    def stop(self, handle: Any) -> None:
+        """Interrupt the task, which asks its child to stop."""
+        self._ray.cancel(handle, force=False)
+
+
+@contextlib.contextmanager
+def stop_on_signal() -> Iterator[threading.Event]:
+    """Turn the first SIGINT or SIGTERM into an event; a second one interrupts at once."""
+    event = threading.Event()
+
+    def ask(number: int, frame: Any) -> None:
+        if event.is_set():
+            raise KeyboardInterrupt
+        event.set()
+
+    old = {s: signal.signal(s, ask) for s in (signal.SIGTERM, signal.SIGINT)}
+    try:
+        yield event
+    finally:
+        for number, handler in old.items():
+            signal.signal(number, handler)
+
+
+def run_all(
+    jobs: Sequence[Job],
+    executor: Executor,
+    *,
+    retries: int,
+    stop: threading.Event,
+    show: Callable[[Mapping[str, Progress]], None],
+    poll_s: float = 1.0,
+) -> dict[str, Progress]:
+    """Run every job after those it needs; one that fails takes only its dependants along.
+
+    Args:
+        jobs: What to run; a need that is not among them counts as done.
+        executor: Where to run.
+        retries: Further attempts after a crash.
+        stop: When set, running jobs are asked to stop and nothing new is started.
+        show: Called after every change and about once per ``poll_s``.
+        poll_s: Longest time between two looks, s.
+
+    Returns:
+        The progress of every job, by name.
+    """
+    table = {job.name: Progress(job) for job in jobs}
+    handles: dict[Any, Progress] = {}
+    while not stop.is_set():
+        _block(table)
+        for progress in _ready(table)[: max(0, executor.capacity() - len(handles))]:
+            progress.state, progress.began = "running", time.monotonic()
+            progress.attempts += 1
+            handles[executor.submit(progress.job)] = progress
+        show(table)
+        if not handles:
+            if all(progress.state != "waiting" for progress in table.values()):
+                break
+            time.sleep(poll_s)  # a cluster without room at the moment
+            continue
+        for handle in executor.finished(list(handles), poll_s):
+            _settle(handles.pop(handle), handle, executor, retries)
+    if handles:
+        _stop_all(handles, executor, show=lambda: show(table))
+    show(table)
+    return table
+
+
+def _ready(table: Mapping[str, Progress]) -> list[Progress]:
+    return [
+        p
+        for p in table.values()
+        if p.state == "waiting" and all(table[n].state == "done" for n in p.job.needs if n in table)
+    ]
+
+
+def _block(table: Mapping[str, Progress]) -> None:
+    """Mark the jobs whose needs can no longer be met; jobs stand after what they need."""
+    for progress in table.values():
+        lost = [n for n in progress.job.needs if n in table and table[n].state in _LOST]
+        if progress.state == "waiting" and lost:
+            progress.state, progress.reason = "blocked", f"needs {lost[0]}"
+
+
+_LOST = ("failed", "blocked", "stopped")
+
+
+def _settle(progress: Progress, handle: Any, executor: Executor, retries: int) -> None:
+    """Enter how an attempt ended: done, to be tried again, stopped or failed."""
+    progress.seconds = time.monotonic() - progress.began
+    try:
+        ending = executor.ending(handle)
+    except Exception as error:  # the worker was lost: any of Ray's errors
+        code, progress.reason = 1, f"worker lost: {type(error).__name__}"
+    else:
+        code, progress.where = ending.code, ending.where
+        progress.reason = _reason(code)
+    if code == 0:
+        progress.state = "done"
+    elif code == STOPPED:
+        progress.state = "stopped"
+    elif code != NO_RETRY and progress.attempts <= retries:
+        progress.state = "waiting"
+    else:
+        progress.state = "failed"
+
+
+def _reason(code: int) -> str:
+    if code == 0:
+        return ""
+    return f"killed by {signal.Signals(-code).name}" if code < 0 else f"exit status {code}"
+
+
+def _stop_all(handles: dict[Any, Progress], executor: Executor, show: Callable[[], None]) -> None:
+    """Ask what runs to stop and wait for it."""
+    for handle in handles:
+        executor.stop(handle)
+    deadline = time.monotonic() + STOP_WAIT_S
+    while handles and time.monotonic() < deadline:
+        for handle in executor.finished(list(handles), 1.0):
+            progress = handles.pop(handle)
+            _settle(progress, handle, executor, 0)
+            if progress.state == "failed":  # cancelled before or while it stopped
+                progress.state = "stopped"
+        show()
+    for progress in handles.values():
+        progress.state, progress.reason = "stopped", "did not stop in time"

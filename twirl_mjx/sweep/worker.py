@@ -1,0 +1,110 @@
+"""What a worker does with one run: claim a core, run it as a child process, report how it ended."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import fcntl
+import os
+import platform
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+from twirl_mjx.sweep import launch
+
+STOP_S = 90.0
+"""Time a child has to save its state after it was asked to stop."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Job:
+    """One run to start."""
+
+    name: str
+    """Its name, unique in the sweep."""
+    argv: tuple[str, ...]
+    """Arguments for this interpreter, for example ``-m twirl_mjx train ...``."""
+    log: str
+    """File that its output is appended to."""
+    needs: tuple[str, ...] = ()
+    """Names of the jobs that have to be done before."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Ending:
+    """How one attempt ended."""
+
+    code: int
+    """Exit status of the process; negative: killed by that signal."""
+    where: str
+    """Machine and core."""
+
+
+@contextlib.contextmanager
+def claim_core() -> Iterator[int | None]:
+    """Hold one core of those this process may use, by a lock that ends with the process.
+
+    The locks are shared by all sweeps of a user on a machine, so two never pin to one core.
+
+    Yields:
+        The core; None when the machine cannot pin or every core is held.
+    """
+    cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
+    folder = Path(tempfile.gettempdir()) / f"twirl_mjx-cores-{os.getuid()}"
+    folder.mkdir(mode=0o700, exist_ok=True)
+    for core in cores:
+        with (folder / f"{core}.lock").open("a") as file:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                continue
+            yield core
+            return
+    yield None
+
+
+def run_job(job: Job, *, pin: bool = True) -> Ending:
+    """Run a job as a child process and wait for it.
+
+    The child dies with this process. ``KeyboardInterrupt`` asks it to save and stop.
+
+    Args:
+        job: What to run.
+        pin: Give it a core of its own; not useful where the work is on an accelerator.
+    """
+    log = Path(job.log)
+    log.parent.mkdir(parents=True, exist_ok=True)
+    with claim_core() if pin else contextlib.nullcontext() as core, log.open("a") as file:
+        place = f"{platform.node()}{'' if core is None else f', core {core}'}"
+        stamp = time.strftime("%Y-%m-%d %H:%M:%S")
+        file.write(f"== {stamp} on {place}: {' '.join(job.argv)}\n")
+        file.flush()
+        target = "-" if core is None else str(core)
+        command = [sys.executable, "-S", launch.__file__, str(os.getpid()), target]
+        child = subprocess.Popen(
+            [*command, sys.executable, *job.argv],
+            stdin=subprocess.DEVNULL,
+            stdout=file,
+            stderr=subprocess.STDOUT,
+        )
+        try:
+            code = _wait(child)
+        finally:
+            if child.poll() is None:
+                child.kill()
+                child.wait()
+        file.write(f"== ended with {code}\n")
+    return Ending(code, place)
+
+
+def _wait(child: subprocess.Popen[bytes]) -> int:
+    try:
+        return child.wait()
+    except KeyboardInterrupt:
+        child.send_signal(signal.SIGTERM)
+        return child.wait(STOP_S)
