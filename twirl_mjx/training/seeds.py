@@ -1,0 +1,121 @@
+"""Several seeds of one config trained by one program, as a batch axis in front of every array.
+
+Every product of the learner then covers all seeds at once, and the native engine gets the worlds
+of all seeds in one call. ``sharding`` spreads the same axis over devices.
+
+What equals what: a seed of a batch draws the same random numbers and steps the same physics as
+the same seed alone, so both agree bit for bit until the first critic update. From there on they
+agree to float32 rounding, because a batched matrix product sums in another order.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+
+from twirl_mjx.config import TrainConfig
+from twirl_mjx.replay.mixed import MixedReplay
+from twirl_mjx.replay.ring import RingBuffer
+from twirl_mjx.tasks.vector import VectorEnv
+from twirl_mjx.training import state as single
+from twirl_mjx.training.state import TrainState
+from twirl_mjx.types import Metrics
+
+
+def per_field(batched: Any, shared: Any) -> Any:
+    """Return a prefix tree of ``TrainState``: ``batched`` where seeds differ, else ``shared``.
+
+    The source ring is read by all seeds, and all seeds are equally far: ``env_steps`` decides how
+    many updates follow a step, which must not differ within one program.
+    """
+    return TrainState(
+        learner=batched,
+        env=batched,
+        replay=MixedReplay(source=shared, online=batched),
+        tracker=batched,
+        key=batched,
+        env_steps=shared,
+        inserted=batched,
+    )
+
+
+AXES = per_field(0, None)
+"""``in_axes`` of a batch of seeds; it shares the source ring and ``env_steps``."""
+
+
+def init_seeds(
+    config: TrainConfig, env: VectorEnv, seeds: Sequence[int], source: RingBuffer | None
+) -> TrainState:
+    """Return the states of several seeds before the first transition.
+
+    Args:
+        config: The run; its ``seed`` is not used.
+        env: Its worlds; every seed has ``env.num_envs`` of its own.
+        seeds: S different seeds.
+        source: Frozen source experience that all seeds share, or None.
+
+    Returns:
+        A state with a leading axis [S] on every leaf but those of ``AXES`` without one.
+
+    Raises:
+        ValueError: No seed, or one that occurs twice.
+    """
+    if not seeds or len(set(seeds)) != len(seeds):
+        raise ValueError(f"seeds {list(seeds)} must be at least one, all different")
+    keys = jax.vmap(jax.random.key)(jax.numpy.asarray(seeds, jax.numpy.uint32))
+
+    def fresh(key: jax.Array) -> TrainState:
+        return single.init(config, env, key, None)
+
+    states = jax.jit(jax.vmap(fresh, out_axes=AXES))(keys)
+    return states.replace(replay=states.replay.replace(source=source))
+
+
+def batch_epoch(
+    config: TrainConfig, env: VectorEnv
+) -> Callable[[TrainState], tuple[TrainState, Metrics]]:
+    """Return ``train_epoch`` of a batch of seeds, not compiled; metrics are [S] each."""
+    epoch = functools.partial(single.train_epoch, config, env)
+    return jax.vmap(epoch, in_axes=(AXES,), out_axes=(AXES, 0))
+
+
+def compile_epoch_seeds(
+    config: TrainConfig, env: VectorEnv
+) -> Callable[[TrainState], tuple[TrainState, Metrics]]:
+    """Return the jitted epoch of a batch of seeds; it donates its argument.
+
+    Args:
+        config: The run.
+        env: The worlds of one seed.
+
+    Returns:
+        A function of a state from ``init_seeds``; its metrics are [S] each.
+    """
+    return jax.jit(batch_epoch(config, env), donate_argnums=0)
+
+
+def num_seeds(states: TrainState) -> int:
+    """Return S of a batch of seeds."""
+    return states.inserted.shape[0]
+
+
+def seed_state(states: TrainState, index: int) -> TrainState:
+    """Return one seed of a batch as a state of its own, for a checkpoint or a policy file.
+
+    Args:
+        states: State of S seeds.
+        index: Place in the batch, 0 to S - 1.
+
+    Raises:
+        ValueError: No such place.
+    """
+    if not 0 <= index < num_seeds(states):
+        raise ValueError(f"seed index {index} is outside [0, {num_seeds(states) - 1}]")
+
+    def pick(axis: int | None, subtree: Any) -> Any:
+        return subtree if axis is None else jax.tree.map(lambda leaf: leaf[index], subtree)
+
+    return jax.tree.map(pick, AXES, states, is_leaf=lambda axis: axis is None)

@@ -1,0 +1,164 @@
+"""One training program on several devices: seeds side by side, or the worlds of one run.
+
+Each device steps its own worlds by itself (``shard_map``), so solvers and auto-resets never wait
+for another device. With worlds spread, learner and replay are copies on every device, and the
+compiler gathers the new transitions into each of them.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import numpy as np
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+
+from twirl_mjx.config import TrainConfig
+from twirl_mjx.tasks.vector import EnvState, VectorEnv
+from twirl_mjx.training import seeds
+from twirl_mjx.training.state import TrainState, train_epoch
+from twirl_mjx.types import Metrics
+
+Epoch = Callable[[TrainState], tuple[TrainState, Metrics]]
+
+SEEDS = "seeds"
+WORLDS = "worlds"
+
+
+def device_mesh(axis: str) -> Mesh:
+    """Return all devices of the default backend in a row called ``axis``."""
+    return Mesh(np.asarray(jax.devices()), (axis,))
+
+
+def shard_seeds(states: TrainState, mesh: Mesh) -> TrainState:
+    """Spread a batch of seeds evenly over the devices of a mesh with the axis ``SEEDS``.
+
+    Raises:
+        ValueError: The number of seeds is not a multiple of the number of devices.
+    """
+    _check_even("seeds", seeds.num_seeds(states), mesh)
+    return jax.device_put(states, _named(seeds.per_field(PartitionSpec(SEEDS), _EVERYWHERE), mesh))
+
+
+def compile_epoch_seeds(config: TrainConfig, env: VectorEnv, mesh: Mesh) -> Epoch:
+    """Return the jitted epoch of a batch of seeds spread by ``shard_seeds``; it donates.
+
+    Args:
+        config: The run.
+        env: The worlds of one seed.
+        mesh: Devices.
+    """
+    specs = seeds.per_field(PartitionSpec(SEEDS), _EVERYWHERE)
+    epoch = jax.shard_map(
+        seeds.batch_epoch(config, env),
+        mesh=mesh,
+        in_specs=(specs,),
+        out_specs=(specs, PartitionSpec(SEEDS)),
+        check_vma=False,  # that env_steps stays equal on all devices is ours to know
+    )
+    return jax.jit(epoch, donate_argnums=0)
+
+
+def shard_worlds(state: TrainState, mesh: Mesh) -> TrainState:
+    """Spread the worlds of one run evenly over the devices of a mesh with the axis ``WORLDS``.
+
+    Raises:
+        ValueError: The number of worlds is not a multiple of the number of devices.
+    """
+    _check_even("env.num_envs", state.env.reward.shape[0], mesh)
+    return jax.device_put(state, _named(_world_specs(), mesh))
+
+
+def compile_epoch_worlds(config: TrainConfig, env: VectorEnv, mesh: Mesh) -> Epoch:
+    """Return the jitted epoch of a run whose worlds were spread by ``shard_worlds``; it donates.
+
+    Args:
+        config: The run.
+        env: All its worlds.
+        mesh: Devices.
+
+    Raises:
+        ValueError: The number of worlds is not a multiple of the number of devices.
+    """
+    state = _named(_world_specs(), mesh)
+    epoch = functools.partial(train_epoch, config, ShardedEnv(env, mesh))
+    return jax.jit(
+        epoch,
+        in_shardings=(state,),
+        out_shardings=(state, NamedSharding(mesh, _EVERYWHERE)),
+        donate_argnums=0,
+    )
+
+
+class ShardedEnv(VectorEnv):
+    """The worlds of another env, stepped on the devices of a mesh, an equal part on each."""
+
+    def __init__(self, env: VectorEnv, mesh: Mesh) -> None:
+        """Divide the worlds.
+
+        Args:
+            env: All worlds.
+            mesh: Devices, with the axis ``WORLDS``.
+
+        Raises:
+            ValueError: The number of worlds is not a multiple of the number of devices.
+        """
+        _check_even("env.num_envs", env.num_envs, mesh)
+        part = env.num_envs // mesh.size
+
+        def make(num_envs: int) -> dict[str, Any]:
+            dynamics = jax.tree.map(lambda leaf: leaf[:num_envs], env.dynamics)
+            return {
+                "num_envs": num_envs,
+                "episode_length": env.episode_length,
+                "dynamics": dynamics,
+            }
+
+        super().__init__(env.task, env.scene, env.engine, **make(env.num_envs))
+        local = VectorEnv(env.task, env.scene, env.engine, **make(part))
+        self._step = jax.shard_map(
+            local.step,
+            mesh=mesh,
+            in_specs=(PartitionSpec(WORLDS), PartitionSpec(WORLDS)),
+            out_specs=PartitionSpec(WORLDS),
+            check_vma=False,  # the solver's loops carry plain constants
+        )
+
+    def step(self, state: EnvState, action: jax.Array) -> EnvState:
+        """Advance every world by one control step; see :class:`VectorEnv`."""
+        return self._step(state, action)
+
+
+_EVERYWHERE = PartitionSpec()
+
+
+def _world_specs() -> TrainState:
+    """Return a prefix tree of specs: worlds divided, everything else on every device."""
+    worlds = PartitionSpec(WORLDS)
+    return TrainState(
+        learner=_EVERYWHERE,
+        env=worlds,
+        replay=_EVERYWHERE,
+        tracker=worlds,
+        key=_EVERYWHERE,
+        env_steps=_EVERYWHERE,
+        inserted=_EVERYWHERE,
+    )  # type: ignore[arg-type]
+
+
+def _named(specs: Any, mesh: Mesh) -> Any:
+    return jax.tree.map(
+        lambda spec: NamedSharding(mesh, spec),
+        specs,
+        is_leaf=lambda node: isinstance(node, PartitionSpec),
+    )
+
+
+def _check_even(what: str, number: int, mesh: Mesh) -> None:
+    if number % mesh.size:
+        nearest = max(1, round(number / mesh.size)) * mesh.size
+        raise ValueError(
+            f"{what} is {number}, not a multiple of the {mesh.size} devices (nearest: {nearest})"
+        )
