@@ -11,6 +11,7 @@ import pytest
 from rich.console import Console
 
 from twirl_mjx.commands import sweep
+from twirl_mjx.figures.tables import read_curves
 from twirl_mjx.sweep import estimate
 from twirl_mjx.sweep.grid import load
 from twirl_mjx.sweep.plan import make_plan
@@ -54,6 +55,27 @@ def test_dry_run_of_chosen_arms_and_seeds(
     assert "phi0.25" not in out
     with pytest.raises(ValueError, match=r"no arm matches 'x'; arms: biped-phi0.25, biped-phi0.5"):
         sweep.main([str(grid_file), "--arms", "x"])
+
+
+def test_tables_hold_more_than_what_was_asked_for(
+    grid_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], finish_run: Finish
+) -> None:
+    runs, results = tmp_path / "runs", tmp_path / "results"
+    for cell in make_plan(load(str(grid_file), seeds=(0, 1, 4)), runs):
+        finish_run(cell, runs)
+
+    def gathered(*more: str) -> dict[str, int]:
+        argv = [str(grid_file), "--gather-only", "--runs", str(runs), "--results", str(results)]
+        assert sweep.main([*argv, *more]) == 0
+        paths = [p for p in (results / "phi").glob("*.csv") if "episodes" not in p.name]
+        tables = {p.stem: read_curves(p) for p in paths}
+        return {arm: len(set(table["seed"])) for arm, table in tables.items()}
+
+    all_arms = {"biped-phi0.25": 2, "biped-phi0.5": 2, "biped-zs": 1}
+    assert gathered() == all_arms
+    assert gathered("--arms", "*phi0.5", "--seeds", "0") == all_arms
+    assert gathered("--arms", "*phi0.5", "--seeds", "4") == all_arms | {"biped-phi0.5": 3}
+    assert "phi: 6 of 6 cells finished; 6 tables" in capsys.readouterr().out
 
 
 def test_estimates_use_what_was_measured(

@@ -59,37 +59,52 @@ def main(argv: list[str]) -> int:
     check_range("retries", options.retries, 0, 100)
     if options.workers is not None:
         check_range("workers", options.workers, 1, 10_000)
-    grid = load(options.grid, reduced=options.reduced, seeds=options.seeds or None)
-    grid = only_arms(grid, options.arms)
+    whole = load(options.grid, reduced=options.reduced)
+    grid = only_arms(
+        load(options.grid, reduced=options.reduced, seeds=options.seeds or None), options.arms
+    )
     runs = options.runs.resolve()
     cells = plan.make_plan(grid, runs, options.nominal)
-    status = {cell.name: plan.status_of(cell, runs) for cell in cells}
+    status: dict[str, plan.Status] = {cell.name: plan.status_of(cell, runs) for cell in cells}
     todo = wanted(cells, status)
     speeds = estimate.measure(runs)
     estimates = {cell.name: estimate.estimate(cell, runs, speeds) for cell in todo}
     console = Console()
     title = f"{grid.results_name}: {sum(1 for c in cells if c.arm)} cells"
-    code = 0
     if options.dry_run:
-        shown = [c for c in cells if c.arm or c in todo]
         if not console.is_terminal:
             console.width = 400
+        shown = [c for c in cells if c.arm or c in todo]
         console.print(plan_table(title, shown, status, estimates))
         say(total_line(todo, estimates, options))
         return 0
+    code = 0
     if todo and not options.gather_only:
         say(total_line(todo, estimates, options))
         with SweepView(console, title, todo, runs, estimates) as view:
-            table = _run(todo, runs, options, view)
-        code = report(table)
+            code = report(_run(todo, runs, options, view))
+    _gather(joined(whole, grid), runs, options)
+    return code
+
+
+def _gather(grid: Grid, runs: Path, options: SweepOptions) -> None:
+    """Write the tables of all arms, not only of those that were asked for, and say so."""
+    cells = plan.make_plan(grid, runs, options.nominal)
     results = options.results or grids_folder() / "results"
     written = gather.gather(grid, cells, runs, results)
-    finished = sum(1 for c in cells if c.arm and plan.is_finished(c, runs))
+    arms = [cell for cell in cells if cell.arm]
+    finished = sum(plan.is_finished(cell, runs) for cell in arms)
     say(
-        f"{grid.results_name}: {finished} of {sum(1 for c in cells if c.arm)} cells finished;"
+        f"{grid.results_name}: {finished} of {len(arms)} cells finished;"
         f" {len(written)} tables in {results / grid.results_name}"
     )
-    return code
+
+
+def joined(whole: Grid, part: Grid) -> Grid:
+    """Return a grid with further cells (other seeds), without repeating any."""
+    drafts = dict.fromkeys((*whole.drafts, *part.drafts))
+    arms = dict.fromkeys(draft.arm for draft in drafts)
+    return dataclasses.replace(whole, drafts=tuple(d for a in arms for d in drafts if d.arm == a))
 
 
 def only_arms(grid: Grid, pattern: str) -> Grid:
@@ -105,7 +120,7 @@ def only_arms(grid: Grid, pattern: str) -> Grid:
     return dataclasses.replace(grid, drafts=kept)
 
 
-def wanted(cells: Sequence[plan.Cell], status: Mapping[str, str]) -> list[plan.Cell]:
+def wanted(cells: Sequence[plan.Cell], status: Mapping[str, plan.Status]) -> list[plan.Cell]:
     """Return the cells that are not finished, and of the runs they need those that are not.
 
     What others need comes first.

@@ -100,7 +100,7 @@ class RayExecutor:
         if self._gpus > there:
             self.close()
             raise ValueError(f"{self._gpus:g} GPUs per run asked for, {there:g} available")
-        self._task = ray.remote(run_job)
+        self._task: Any = ray.remote(run_job)
         self._options: dict[str, Any] = {"num_cpus": 1, "num_gpus": self._gpus, "max_retries": 0}
         if 0.0 < self._gpus < 1.0:  # jobs that share a GPU may only claim their part of it
             part = {"XLA_PYTHON_CLIENT_MEM_FRACTION": f"{0.9 * self._gpus:.3f}"}
