@@ -316,19 +316,6 @@ def resolve_policy_path(path: str | Path) -> Path:
     )
 
 
-def read_actor(path: str | Path) -> Params:
-    """Return the actor parameters in a policy file (``.npz``).
-
-    Raises:
-        FileNotFoundError: No such file.
-        PolicyFileError: The file is no policy with network weights.
-    """
-    file = resolve_policy_path(path)
-    if file.suffix != ".npz":
-        raise PolicyFileError(f"{file} holds no actor parameters: only .npz policy files do")
-    return dict(_read_npz(file).actor_params)
-
-
 def load_policy(path: str | Path) -> NumpyPolicy | OnnxPolicy:
     """Load a policy to act with: ``policy.act(obs) -> action``.
 

@@ -21,7 +21,7 @@ from twirl_mjx.config import TrainConfig
 from twirl_mjx.droq import learner as droq
 from twirl_mjx.droq.state import DroqState
 from twirl_mjx.evaluation.rollout import make_evaluate
-from twirl_mjx.policies.learned import PolicyHeader, read_actor, save_policy
+from twirl_mjx.policies.learned import NumpyPolicy, PolicyHeader, load_policy, save_policy
 from twirl_mjx.replay.ring import RingBuffer
 from twirl_mjx.tasks.observations import layout_slices
 from twirl_mjx.tasks.registry import make_env
@@ -287,7 +287,9 @@ def train(
 
 def final_evaluation(config: TrainConfig, run_dir: Path, env_steps: int) -> dict[str, float]:
     """Evaluate the best policy of a run on fresh seeds and write ``eval.csv``."""
-    actor = jax.tree.map(jnp.asarray, read_actor(run_dir / "policy.npz"))
+    policy = load_policy(run_dir / "policy.npz")
+    assert isinstance(policy, NumpyPolicy), "a run writes .npz policies"
+    actor = jax.tree.map(jnp.asarray, dict(policy.actor_params))
     env = make_env(config, num_envs=config.eval.final_episodes)
     evaluate = make_evaluate(env, no_memory, act_mean)
     values = evaluate(actor, jax.random.key(config.eval.seed + 1))

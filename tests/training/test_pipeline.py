@@ -1,0 +1,145 @@
+"""The variants are settings of one program; sources are black boxes; shifts start from a run."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from twirl_mjx.config import TrainConfig
+from twirl_mjx.deploy.export import export_onnx
+from twirl_mjx.droq import learner as droq
+from twirl_mjx.policies.learned import load_policy
+from twirl_mjx.policies.resolve import resolve_policy
+from twirl_mjx.presets import make_config
+from twirl_mjx.replay import dataset
+from twirl_mjx.tasks.registry import make_env
+from twirl_mjx.training import pipeline, rundir
+from twirl_mjx.training.checkpoint import load_replay
+from twirl_mjx.training.source import collect
+
+
+@pytest.fixture(scope="module")
+def biped() -> TrainConfig:
+    return dataclasses.replace(make_config("biped", "debug"), total_env_steps=64)
+
+
+@pytest.fixture(scope="module")
+def runs(biped: TrainConfig, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a finished nominal biped run from a scripted source."""
+    folder = tmp_path_factory.mktemp("runs")
+    config = dataclasses.replace(biped, source="trot")
+    run_dir = pipeline.run(config, "debug", folder, None, print)
+    assert run_dir.name == "biped-twirl-debug-s0"
+    return folder
+
+
+def test_scripted_source_is_recorded_in_the_target_task(biped: TrainConfig, runs: Path) -> None:
+    header, data = dataset.read(
+        runs / "biped-twirl-debug-s0" / "source.npz",
+        task="biped",
+        observation_size=101,
+        action_size=12,
+    )
+    assert (header.source, header.size) == ("scripted trot", biped.replay.source_size)
+    assert np.abs(np.asarray(data.action)).max() > 0.1
+
+
+def test_collected_data_are_used_again_until_settings_change(
+    biped: TrainConfig, runs: Path
+) -> None:
+    said: list[str] = []
+    config = dataclasses.replace(biped, source="trot")
+    source = pipeline.find_source(config, "debug", runs, said.append)
+    run_dir = runs / "biped-twirl-debug-s0"
+    pipeline.source_data(config, run_dir, source, said.append)
+    assert any("source.npz" in line for line in said)
+    assert not any("collecting" in line for line in said)
+    other = dataclasses.replace(source, digest="another policy")
+    digest = pipeline.collection_digest(config, other)
+    assert digest != pipeline.collection_digest(config, source)
+
+
+@pytest.mark.parametrize("variant", ["weights", "twirl+weights", "twirl", "zero-shot"])
+def test_adaptation_starts_from_the_nominal_run(
+    biped: TrainConfig, runs: Path, variant: str
+) -> None:
+    said: list[str] = []
+    config = dataclasses.replace(biped, shift="icy", variant=variant)  # type: ignore[arg-type]
+    run_dir = pipeline.run(config, "debug", runs, None, said.append)
+    with (run_dir / "eval.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert {row["shift"] for row in rows} == {"icy"}
+    assert {row["variant"] for row in rows} == {variant}
+    replayed = any("the replay of" in line for line in said)
+    assert replayed == (variant in ("twirl", "twirl+weights"))
+    assert not (run_dir / "source.npz").exists(), "adaptation collects nothing"
+
+
+def test_source_networks_are_taken_over(biped: TrainConfig, runs: Path) -> None:
+    config = dataclasses.replace(biped, shift="icy", variant="weights")
+    source = pipeline.find_source(config, "debug", runs, print)
+    initial = pipeline.source_weights(config, source, print)
+    fresh = droq.init(jax.random.key(7), config.droq, 101, 12)
+    taken = initial(fresh)
+    policy = load_policy(runs / "biped-twirl-debug-s0")
+    obs = np.random.default_rng(0).normal(size=(3, 101)).astype(np.float32)
+    last = load_policy(runs / "biped-twirl-debug-s0" / "policy_last.npz")
+    expected = droq.mean_action(taken.actor, jnp.asarray(obs))
+    np.testing.assert_allclose(last.act(obs), np.asarray(expected), atol=1e-6)
+    assert policy.observation_size == 101
+    jax.tree.map(
+        lambda a, b: (
+            np.testing.assert_raises(AssertionError, np.testing.assert_array_equal, a, b)
+            if a.size > 1 and np.ptp(np.asarray(a)) > 0
+            else None
+        ),
+        taken.critic,
+        fresh.critic,
+    )
+
+
+def test_weights_refuse_sources_that_do_not_fit(biped: TrainConfig, runs: Path) -> None:
+    scripted = dataclasses.replace(biped, variant="weights", source="trot")
+    source = pipeline.find_source(scripted, "debug", runs, print)
+    with pytest.raises(ValueError, match="no network weights"):
+        pipeline.source_weights(scripted, source, print)
+    hurdles = dataclasses.replace(make_config("hurdles", "debug"), variant="weights")
+    source = pipeline.find_source(
+        dataclasses.replace(hurdles, source=str(runs / "biped-twirl-debug-s0")),
+        "debug",
+        runs,
+        print,
+    )
+    with pytest.raises(ValueError, match="observes as task biped"):
+        pipeline.source_weights(hurdles, source, print)
+
+
+def test_replay_of_the_nominal_run_is_the_source(runs: Path) -> None:
+    rows = load_replay(runs / "biped-twirl-debug-s0")
+    assert rows.shape == (64, 2 * 101 + 12 + 2)
+    assert np.isfinite(rows).all()
+
+
+def test_onnx_source_acts_like_the_policy_it_came_from(
+    biped: TrainConfig, runs: Path, tmp_path: Path
+) -> None:
+    run_dir = runs / "biped-twirl-debug-s0"
+    onnx = export_onnx(run_dir, tmp_path / "policy.onnx")
+    env = make_env(biped, num_envs=2)
+    key = jax.random.key(4)
+    learned, _ = collect(env, resolve_policy(str(run_dir), biped).policy, key, 12)
+    hosted, _ = collect(env, resolve_policy(str(onnx), biped).policy, key, 12)
+    np.testing.assert_allclose(hosted.action, learned.action, atol=1e-4)
+    assert learned.reward.shape == (12,)
+
+
+def test_directory_of_another_config_is_refused(biped: TrainConfig, runs: Path) -> None:
+    other = dataclasses.replace(biped, source="trot", warmup_env_steps=0)
+    with pytest.raises(rundir.RunMismatchError, match="warmup_env_steps: 32 -> 0"):
+        pipeline.run(other, "debug", runs, None, print)
