@@ -28,7 +28,7 @@ def _paper(task: str) -> TrainConfig:
     )
 
 
-CPU_ENV_STEPS = {"stand": 1_600_000, "biped": 1_200_000, "imitate": 1_600_000, "hurdles": 1_200_000}
+CPU_ENV_STEPS = {"stand": 1_600_000, "biped": 800_000, "imitate": 1_600_000, "hurdles": 1_200_000}
 """Transitions per task that fit two CPU cores in about an hour each."""
 
 
@@ -46,7 +46,7 @@ def _cpu(task: str) -> TrainConfig:
             utd=0.5,
             updates_per_block=8,
             initial_temperature=0.1,
-            discount=0.97 if task == "stand" else 0.99,
+            discount=0.97 if task in ("stand", "biped") else 0.99,
         ),
         eval=EvalConfig(every=96_000, episodes=32),
         stand=StandConfig(height_of="front_feet", risen_fraction=0.9),
