@@ -151,17 +151,14 @@ class NativeEngine:
     ) -> tuple[mjx.Data, Trace]:
         """Advance all worlds; see :class:`Engine`."""
         num_envs, n_substeps = data.qpos.shape[0], self._scene.options.n_substeps
-        d = dynamics
-        scalars = jnp.stack([d.gravity, d.friction, d.incline, d.bump_height], axis=-1)
+        ground = (dynamics.gravity, dynamics.friction, dynamics.incline, dynamics.bump_height)
         motors = (command.kp, command.kd, command.torque_limit)
-        physics = jnp.concatenate([scalars, *motors], axis=-1)
-        out = jax.ShapeDtypeStruct((num_envs, n_substeps, 37), jnp.float32)
+        start = (data.qpos, data.qvel)
+        packed = jnp.concatenate([jnp.stack(ground, -1), *motors, command.target, *start], axis=-1)
         states = jax.pure_callback(
             self._host_step,
-            out,
-            jnp.concatenate([data.qpos, data.qvel], axis=-1),
-            command.target,
-            physics,
+            jax.ShapeDtypeStruct((num_envs, n_substeps, 37), jnp.float32),
+            packed,  # in one piece: every argument of a callback costs a copy and a dispatch
             vmap_method="broadcast_all",
         )
         trace = Trace(qpos=states[..., :19], qvel=states[..., 19:])
@@ -173,12 +170,11 @@ class NativeEngine:
         )
         return data, trace
 
-    def _host_step(self, state: np.ndarray, target: np.ndarray, physics: np.ndarray) -> np.ndarray:
+    def _host_step(self, packed: np.ndarray) -> np.ndarray:
         # Leading axes are worlds, and seeds when the caller is vmapped over them.
-        lead = np.shape(state)[:-1]
-        state = np.asarray(state, np.float64).reshape(-1, 37)
-        target = np.asarray(target, np.float64).reshape(-1, 12)
-        physics = np.asarray(physics, np.float64).reshape(-1, physics.shape[-1])
+        lead = np.shape(packed)[:-1]
+        columns = np.asarray(packed, np.float64).reshape(-1, 89)
+        physics, target, state = np.split(columns, [40, 52], axis=1)
         with self._lock:
             models = self._prepare(physics)
             start = np.concatenate([np.zeros((len(state), 1)), state], axis=1)
