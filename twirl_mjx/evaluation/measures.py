@@ -53,6 +53,7 @@ MEASURES: dict[str, dict[str, Measure]] = {
     | {
         "tracking": Measure("tracking", "mean", 1.0, "1", "mean reward over its maximum"),
         "leaps": Measure("leaps", "max", 1.0, "1", "leap cycles completed"),
+        "flights": Measure("flights", "max", 1.0, "1", "cycles with a flight of 4 steps or more"),
     },
     "hurdles": COMMON
     | {

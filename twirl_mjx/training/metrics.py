@@ -59,6 +59,7 @@ METRICS: dict[str, MetricInfo] = {
     "min_distance": MetricInfo("closest approach to the goal in an episode", "m"),
     "tracking": MetricInfo("imitation reward over its maximum", "1"),
     "leaps": MetricInfo("leap cycles completed in an episode", "1"),
+    "flights": MetricInfo("leap cycles with all feet airborne for 4 control steps or more", "1"),
     "hurdles_passed": MetricInfo("hurdles passed in an episode", "1"),
     "clean_clearances": MetricInfo("hurdles passed in a single flight phase", "1"),
     "hit_hurdle": MetricInfo("share of episodes ended by touching a hurdle", "share"),
