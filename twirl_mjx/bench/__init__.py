@@ -1,0 +1,1 @@
+"""Measurements of this machine: learner, worlds, start-up and one training epoch."""

@@ -1,0 +1,297 @@
+"""Critic updates per second: one learner, a batch of seeds, pinned workers, beside SBX's DroQ.
+
+A minibatch is drawn for every update, as in training and as SBX does. All rates come from one
+run, measured in turn (ours, SBX, ours, SBX ...), so that a machine that slows down slows them all.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import json
+import subprocess
+from pathlib import Path
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from twirl_mjx.bench import matmuls
+from twirl_mjx.bench.measure import (
+    Chain,
+    Record,
+    available_cpus,
+    machine,
+    progress,
+    sample_rates,
+    summary,
+)
+from twirl_mjx.bench.worker import Worker, pinning_missing
+from twirl_mjx.config import DroqConfig, check_range
+from twirl_mjx.droq import learner as droq
+from twirl_mjx.replay import mixed, ring
+
+ROWS = 50_000
+"""Transitions in the replay, as in the SBX peer."""
+BLOCKS = 4
+"""Blocks of updates in one compiled call."""
+
+
+@dataclasses.dataclass(frozen=True)
+class LearnerBench:
+    """Measure critic updates per second; the defaults are the paper's sizes on ``biped``."""
+
+    json: bool = False
+    """Print one JSON document on stdout, and nothing else."""
+    seconds: float = 75.0
+    """Length of all measurements together in s, without compilation."""
+    rounds: int = 2
+    """Times that everything is measured in turn."""
+    obs: int = 101
+    """Length of an observation."""
+    action: int = 12
+    """Length of an action."""
+    batch: int = 256
+    """Rows of a minibatch."""
+    utd: int = 20
+    """Critic updates per update of the actor."""
+    hidden: int = 256
+    """Units of each of the two hidden layers."""
+    seeds: int | None = None
+    """Learners in one program (a vmap axis); as many as CPUs by default, at least 2."""
+    workers: int | None = None
+    """Learners in processes pinned to one CPU each; as many as CPUs by default, 0 for none."""
+    plain: bool = False
+    """Measure the plain flax/optax form instead of the fast one."""
+    matmul_dtype: Literal["float32", "bfloat16"] = "float32"
+    """Precision of matrix products (SBX always uses float32)."""
+    sbx: bool = True
+    """Measure SBX's DroQ too, if its environment ``.venv-bench`` exists."""
+
+    def __post_init__(self) -> None:
+        """Check every number.
+
+        Raises:
+            ValueError: A value is out of range.
+        """
+        check_range("seconds", self.seconds, 0.1, 3600.0)
+        for name in ("rounds", "obs", "action", "batch", "utd", "hidden"):
+            check_range(name, getattr(self, name), 1, 1_000_000)
+        check_range("seeds", self.num_seeds, 1, 1000)
+        check_range("workers", self.num_workers, 0, len(available_cpus()))
+
+    @property
+    def num_seeds(self) -> int:
+        """Learners on the batch axis."""
+        return max(2, len(available_cpus())) if self.seeds is None else self.seeds
+
+    @property
+    def num_workers(self) -> int:
+        """Pinned learners."""
+        return len(available_cpus()) if self.workers is None else self.workers
+
+    @property
+    def droq(self) -> DroqConfig:
+        """Settings of the learner."""
+        return DroqConfig(
+            hidden_sizes=(self.hidden, self.hidden),
+            batch_size=self.batch,
+            utd=float(self.utd),
+            updates_per_block=self.utd,
+            fast=not self.plain,
+            matmul_dtype=self.matmul_dtype,
+        )
+
+
+def random_ring(options: LearnerBench, seeds: int) -> ring.RingBuffer:
+    """Return full replays of random rows, of the ranges that the SBX peer uses too.
+
+    Drawn by numpy, which compiles nothing. With more than one seed, leaves are [S, ...].
+    """
+    rng = np.random.default_rng(0)
+    lead = (ROWS,) if seeds == 1 else (seeds, ROWS)
+
+    def normal() -> np.ndarray:
+        return rng.standard_normal((*lead, options.obs), np.float32)
+
+    ends = rng.uniform(size=(*lead, 1)) < 0.01
+    reward = rng.uniform(0, 2, (*lead, 1))
+    action = rng.uniform(-1, 1, (*lead, options.action))
+    rows = np.concatenate([normal(), action, reward, ends, normal()], axis=-1, dtype=np.float32)
+    return ring.RingBuffer(
+        rows=jnp.asarray(rows),
+        insert_index=jnp.asarray(np.zeros(lead[:-1], np.int32)),
+        size=jnp.asarray(np.full(lead[:-1], ROWS, np.int32)),
+        obs_size=options.obs,
+        action_size=options.action,
+    )
+
+
+def make_learner(options: LearnerBench, seeds: int) -> tuple[Chain, int]:
+    """Compile sampling and updates of a batch of learners.
+
+    Returns:
+        The compiled chain, and the updates that one call does (of all seeds together).
+    """
+    config = options.droq
+
+    def init(key: jax.Array) -> droq.DroqState:
+        return droq.init(key, config, options.obs, options.action)
+
+    def block(carry: Any, replay: mixed.MixedReplay) -> Any:
+        learner, key = carry
+        key, sample_key, update_key = jax.random.split(key, 3)
+        minibatches = mixed.sample(
+            replay, sample_key, num_minibatches=options.utd, batch_size=options.batch, phi=0.0
+        )
+        return droq.update(learner, config, minibatches, update_key)[0], key
+
+    def run(carry: Any, online: ring.RingBuffer) -> Any:
+        replay = mixed.MixedReplay(source=None, online=online)
+        return jax.lax.scan(lambda c, _: (block(c, replay), None), carry, length=BLOCKS)[0]
+
+    learner, online = jax.jit(init)(jax.random.key(0)), random_ring(options, seeds)
+    if seeds == 1:
+        return Chain(run, (learner, jax.random.key(1)), online), BLOCKS * options.utd
+    # One first state for all seeds: what they draw differs, and only the time matters.
+    learners = jax.tree.map(lambda x: jnp.asarray(np.stack([np.asarray(x)] * seeds)), learner)
+    state = learners, jax.random.split(jax.random.key(1), seeds)
+    return Chain(jax.vmap(run), state, online), BLOCKS * options.utd * seeds
+
+
+def make_bound(options: LearnerBench, layout: matmuls.Layout) -> tuple[Chain, int]:
+    """Compile the bare matrix products; returns the chain and the updates of one call."""
+    shapes = matmuls.Shapes(options.obs, options.action, options.batch, options.hidden, options.utd)
+    tensors = matmuls.to_layout(matmuls.inputs(shapes), layout)
+
+    def run(_: Any, given: dict[str, jax.Array]) -> Any:
+        return matmuls.block(given, layout, options.matmul_dtype)
+
+    shape = jax.eval_shape(run, None, tensors)
+    first = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shape)
+    return Chain(run, first, tensors, donate=False), options.utd
+
+
+def sbx_missing(options: LearnerBench) -> str | None:
+    """Return why SBX cannot be measured, or None."""
+    if not options.sbx:
+        return "switched off (--no-sbx)"
+    if not _sbx_python().is_file():
+        return "no environment .venv-bench (make bench-setup)"
+    if options.hidden != 256:
+        return f"the SBX peer has 256 hidden units, not {options.hidden}"
+    return None
+
+
+def _sbx_python() -> Path:
+    return Path(__file__).resolve().parents[2] / ".venv-bench" / "bin" / "python"
+
+
+def sbx_samples(options: LearnerBench, seconds: float) -> list[float]:
+    """Run SBX's DroQ in a process of its own; returns critic updates per second.
+
+    Raises:
+        RuntimeError: It failed; the message has the end of its output.
+    """
+    sizes = {
+        "obs-size": options.obs,
+        "action-size": options.action,
+        "batch-size": options.batch,
+        "utd": options.utd,
+        "rows": ROWS,
+        "seconds": seconds,
+    }
+    script = Path(__file__).with_name("sbx_peer.py")
+    command = [str(_sbx_python()), "-W", "ignore", "-P", str(script)]
+    command += [text for name, value in sizes.items() for text in (f"--{name}", str(value))]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=600, check=False)
+    if done.returncode:
+        raise RuntimeError(f"the SBX peer failed: {done.stderr.strip()[-500:]}")
+    return json.loads(done.stdout.splitlines()[-1])["samples"]
+
+
+def measure(options: LearnerBench) -> Record:
+    """Measure everything in turn, ``options.rounds`` times."""
+    jax.config.update("jax_enable_compilation_cache", False)  # compile_s is cold
+    record_machine = machine()
+    reasons = {"sbx": sbx_missing(options), "workers": pinning_missing(options.num_workers)}
+    progress("bench learner: compiling")
+    single, updates = make_learner(options, 1)
+    batch, batch_updates = single, updates
+    if options.num_seeds > 1:
+        batch, batch_updates = make_learner(options, options.num_seeds)
+    bounds = {layout: make_bound(options, layout) for layout in matmuls.LAYOUTS}
+    kinds = 3 + sum(reason is None for reason in reasons.values())
+    turn = options.seconds / options.rounds / kinds
+    found: dict[str, list[float]] = {}
+
+    with contextlib.ExitStack() as stack:
+        workers: list[Worker] = []
+        if reasons["workers"] is None:
+            cpus = available_cpus()[: options.num_workers]
+            alone = dataclasses.replace(options, workers=0)  # a worker sees one CPU only
+            workers = [
+                stack.enter_context(Worker(cpu, dataclasses.asdict(alone))) for cpu in cpus
+            ]
+        for worker in workers:
+            worker.wait_until_ready()
+        for number in range(options.rounds):
+            progress(f"bench learner: round {number + 1} of {options.rounds}")
+            found.setdefault("single", []).extend(sample_rates(single, updates, turn))
+            if reasons["sbx"] is None:
+                found.setdefault("sbx", []).extend(sbx_samples(options, turn))
+            found.setdefault("seeds", []).extend(sample_rates(batch, batch_updates, turn))
+            for worker in workers:
+                worker.start(turn)
+            for i, worker in enumerate(workers):
+                found.setdefault(f"worker {i}", []).extend(worker.samples())
+            for layout, (chain, work) in bounds.items():
+                found.setdefault(layout, []).extend(sample_rates(chain, work, turn / len(bounds)))
+    return _record(options, found, reasons, single.compile_s, batch.compile_s) | {
+        "machine": record_machine
+    }
+
+
+def _record(
+    options: LearnerBench,
+    found: dict[str, list[float]],
+    reasons: dict[str, str | None],
+    compile_s: float,
+    seeds_compile_s: float,
+) -> Record:
+    """Arrange the samples; a rate that was not measured is None and has a reason."""
+    detail = {name: summary(samples) for name, samples in found.items()}
+    median = {name: part["median"] for name, part in detail.items()}
+    sbx = median.get("sbx")
+    workers = [rate for name, rate in median.items() if name.startswith("worker ")]
+    together = {"vmap": median["seeds"]} | ({"workers": sum(workers)} if workers else {})
+    best = max(together, key=lambda name: together[name])
+    layout = max(matmuls.LAYOUTS, key=lambda name: median[name])
+    shapes = matmuls.Shapes(options.obs, options.action, options.batch, options.hidden, options.utd)
+    return {
+        "part": "learner",
+        "critic_updates_per_s": median["single"],
+        **detail["single"],
+        "matmul_bound_updates_per_s": median[layout],
+        "matmul_bound_layout": layout,
+        "matmul_gflop_per_update": matmuls.flops(shapes) / 1e9,
+        "share_of_matmul_bound": median["single"] / median[layout],
+        "seeds": options.num_seeds,
+        "seeds_updates_per_s": together["vmap"],
+        "workers": len(workers),
+        "workers_updates_per_s": together.get("workers"),
+        "workers_reason": reasons["workers"],
+        "aggregate_updates_per_s": together[best],
+        "aggregate_by": best,
+        "sbx_updates_per_s": sbx,
+        "sbx_reason": reasons["sbx"],
+        "ratio_to_sbx": None if sbx is None else median["single"] / sbx,
+        "aggregate_ratio_to_sbx": None if sbx is None else together[best] / sbx,
+        "compile_s": compile_s,
+        "seeds_compile_s": seeds_compile_s,
+        "form": "plain" if options.plain else "fast",
+        "detail": detail,
+        **{name: getattr(options, name) for name in ("obs", "action", "batch", "utd", "hidden")},
+        "matmul_dtype": options.matmul_dtype,
+    }

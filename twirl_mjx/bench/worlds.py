@@ -1,0 +1,251 @@
+"""Control steps per second of whole environments, and of their bare physics.
+
+The bare engine replays the joint targets that random actions gave, from the same states and with
+the same model: what an environment takes longer is observations, rewards, filters, motors, guards
+and auto-resets.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import importlib.util
+import time
+from collections.abc import Callable
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+import mujoco.rollout
+import numpy as np
+from mujoco import mjx
+
+from twirl_mjx.bench.measure import (
+    Chain,
+    Record,
+    available_cpus,
+    machine,
+    progress,
+    sample_rates,
+    summary,
+)
+from twirl_mjx.config import TASKS, check_choice, check_range
+from twirl_mjx.sim.engine import resolve_engine
+from twirl_mjx.tasks.registry import make
+from twirl_mjx.tasks.vector import EnvState, VectorEnv
+
+STEPS = 20
+"""Control steps in one compiled call."""
+WARMUP_CALLS = 3
+"""Calls before anything is timed, after which episodes end at different times."""
+HEADLINE_WORLDS = 128
+"""The row whose numbers stand at the top of the record, of the engine that ``auto`` chooses."""
+
+
+@dataclasses.dataclass(frozen=True)
+class WorldsBench:
+    """Measure worlds with random actions, beside their bare physics."""
+
+    json: bool = False
+    """Print one JSON document on stdout, and nothing else."""
+    seconds: float = 48.0
+    """Length of all measurements together in s, without compilation."""
+    limit: float = 330.0
+    """s, no further row is started after this time; rows that are left out say so."""
+    engine: Literal["both", "mjx", "native"] = "both"
+    """Physics engine."""
+    num_envs: tuple[int, ...] = (1, 16, 128, 1024)
+    """Numbers of worlds stepped together."""
+    task: str = "stand"
+    """Task."""
+
+    def __post_init__(self) -> None:
+        """Check names and numbers.
+
+        Raises:
+            ValueError: A value is out of range.
+        """
+        check_choice("task", self.task, TASKS)
+        check_range("seconds", self.seconds, 0.1, 3600.0)
+        check_range("limit", self.limit, 0.0, 1e6)
+        if not self.num_envs:
+            raise ValueError("num_envs needs at least one number of worlds")
+        for number in self.num_envs:
+            check_range("num_envs", number, 1, 1_000_000)
+
+    @property
+    def engines(self) -> tuple[str, ...]:
+        """Engines to measure."""
+        return ("native", "mjx") if self.engine == "both" else (self.engine,)
+
+
+def random_steps(env: VectorEnv, state: tuple[EnvState, jax.Array]) -> Any:
+    """Take ``STEPS`` control steps with uniformly random actions.
+
+    Returns:
+        The new state, and the joint targets [STEPS, N, 12] in rad.
+    """
+
+    def step(carry: tuple[EnvState, jax.Array], _: None) -> tuple[Any, jax.Array]:
+        env_state, key = carry
+        key, action_key = jax.random.split(key)
+        shape = (env.num_envs, env.action_size)
+        action = jax.random.uniform(action_key, shape, minval=-1.0, maxval=1.0)
+        env_state = env.step(env_state, action)
+        return (env_state, key), env_state.data.ctrl
+
+    return jax.lax.scan(step, state, length=STEPS)
+
+
+def bare_mjx(env: VectorEnv, data: mjx.Data, targets: jax.Array) -> Callable[[], object]:
+    """Compile ``mjx.step`` of the env's model over joint targets [STEPS, N, 12]."""
+    step = jax.vmap(functools.partial(mjx.step, env.scene.mjx_model))
+    substeps = env.scene.options.n_substeps
+
+    def control_step(d: mjx.Data, target: jax.Array) -> tuple[mjx.Data, None]:
+        d = d.replace(ctrl=target)
+        return jax.lax.scan(lambda x, _: (step(x), None), d, length=substeps)[0], None
+
+    def run(d: mjx.Data, given: jax.Array) -> mjx.Data:
+        return jax.lax.scan(control_step, d, given)[0]
+
+    compiled = jax.jit(run).lower(data, targets).compile()
+    return lambda: jax.block_until_ready(compiled(data, targets))
+
+
+def bare_native(env: VectorEnv, data: mjx.Data, targets: jax.Array) -> Callable[[], object]:
+    """Return ``mujoco.rollout`` of the env's model over joint targets, a control step a call."""
+    substeps, threads = env.scene.options.n_substeps, len(available_cpus())
+    pool = mujoco.rollout.Rollout(nthread=threads)
+    datas = [mujoco.MjData(env.mj_model) for _ in range(threads)]
+    models = [env.mj_model] * env.num_envs
+    start = np.concatenate(
+        [np.zeros((env.num_envs, 1)), np.asarray(data.qpos), np.asarray(data.qvel)], axis=1
+    ).astype(np.float64)
+    control = np.repeat(np.asarray(targets, np.float64)[:, :, None], substeps, axis=2)
+    out = np.empty((env.num_envs, substeps, start.shape[1]))
+
+    def run() -> np.ndarray:
+        state = start
+        for given in control:
+            pool.rollout(models, datas, state, given, skip_checks=True, nstep=substeps, state=out)
+            state = out[:, -1].copy()
+        return state
+
+    return run
+
+
+def measure_row(task: str, engine: str, num_envs: int, seconds: float) -> Record:
+    """Measure one number of worlds on one engine.
+
+    Args:
+        task: Task.
+        engine: ``mjx`` or ``native``.
+        num_envs: N.
+        seconds: Length of both measurements together in s.
+    """
+    progress(f"bench worlds: {engine}, {num_envs} worlds")
+    env = make(task, num_envs=num_envs, engine=engine)
+    state = jax.jit(env.reset)(jax.random.key(0))
+
+    def run(carry: Any) -> Any:
+        return random_steps(env, carry[0])
+
+    targets = jnp.zeros((STEPS, num_envs, env.action_size))
+    chain = Chain(run, ((state, jax.random.key(1)), targets), donate=False)
+    for _ in range(WARMUP_CALLS):
+        before = chain.state[0][0].data
+        chain()
+    targets = chain.state[1]
+    rates = summary(sample_rates(chain, STEPS * num_envs, seconds / 2))
+    began = time.perf_counter()
+    bare_call = (bare_mjx if engine == "mjx" else bare_native)(env, before, targets)
+    bare_compile_s = time.perf_counter() - began
+    bare = summary(sample_rates(bare_call, STEPS * num_envs, seconds / 2))
+    substeps = env.scene.options.n_substeps
+    return {
+        "task": task,
+        "engine": engine,
+        "num_envs": num_envs,
+        "control_steps_per_s": rates["median"],
+        "physics_steps_per_s": rates["median"] * substeps,
+        "bare_physics_steps_per_s": bare["median"] * substeps,
+        "environment_overhead": bare["median"] / rates["median"] - 1.0,
+        "control_steps_spread": rates["spread"],
+        "bare_spread": bare["spread"],
+        "samples": rates["samples"],
+        "bare_samples": bare["samples"],
+        "compile_s": chain.compile_s,
+        "bare_compile_s": bare_compile_s,
+    }
+
+
+def envpool_rate(num_envs: int, seconds: float) -> tuple[float | None, str | None]:
+    """Return control steps per second of EnvPool's quadruped, or None and the reason."""
+    if importlib.util.find_spec("envpool") is None:
+        return None, "envpool is not installed"
+    import envpool  # pyright: ignore[reportMissingImports]
+
+    name = "QuadrupedWalk-v1"
+    if name not in envpool.list_all_envs():
+        return None, f"this envpool has no {name}"
+    env = envpool.make(
+        name, env_type="gymnasium", num_envs=num_envs, num_threads=len(available_cpus())
+    )
+    env.reset()
+    rng = np.random.default_rng(0)
+    actions = rng.uniform(-1, 1, (64, num_envs, *env.action_space.shape)).astype(np.float64)
+
+    def run() -> None:
+        for action in actions:
+            env.step(action)
+
+    rate = summary(sample_rates(run, len(actions) * num_envs, seconds))["median"]
+    return rate, None
+
+
+def measure(options: WorldsBench) -> Record:
+    """Measure every number of worlds on every engine; the headline's number of worlds first."""
+    began = time.perf_counter()
+    record_machine = machine()
+    each = options.seconds / (len(options.num_envs) * len(options.engines))
+    order = sorted(set(options.num_envs), key=lambda n: (n != HEADLINE_WORLDS, n))
+    rows, skipped = [], []
+    for engine in options.engines:
+        for num_envs in order:
+            if time.perf_counter() - began > options.limit:
+                reason = f"not started after {options.limit:g} s (--limit)"
+                skipped.append({"engine": engine, "num_envs": num_envs, "reason": reason})
+                continue
+            rows.append(measure_row(options.task, engine, num_envs, each))
+    rate, reason = envpool_rate(HEADLINE_WORLDS, each)
+    rows.sort(key=lambda row: (row["engine"], row["num_envs"]))
+    head = headline(rows, options)
+    speedups = {
+        str(row["num_envs"]): row["control_steps_per_s"] / other["control_steps_per_s"]
+        for row in rows
+        for other in rows
+        if (row["engine"], other["engine"]) == ("native", "mjx")
+        and row["num_envs"] == other["num_envs"]
+    }
+    return {
+        "part": "worlds",
+        **head,
+        "rows": rows,
+        "skipped": skipped,
+        "native_over_mjx": speedups,
+        "envpool_quadruped_steps_per_s": rate,
+        "envpool_reason": reason,
+        "machine": record_machine,
+    }
+
+
+def headline(rows: list[Record], options: WorldsBench) -> Record:
+    """Return the row to show first: the default engine at 128 worlds, or the nearest to it."""
+    default = resolve_engine("auto")
+    if not rows:
+        return {"task": options.task, "control_steps_per_s": None}
+    return min(
+        rows,
+        key=lambda row: (row["engine"] != default, abs(row["num_envs"] - HEADLINE_WORLDS)),
+    )

@@ -1,0 +1,152 @@
+"""``twirl bench [learner|worlds|startup|epoch|all]``."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+import json
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+from twirl_mjx.commands.options import json_text, parse, say
+from twirl_mjx.config import check_choice, check_range
+
+PARTS = ("learner", "worlds", "startup", "epoch")
+
+USAGE = """usage: twirl bench [PART] [options]
+
+parts:
+  learner  critic updates per second, beside SBX and the bare matrix products
+  worlds   control steps per second, beside the bare physics
+  startup  seconds from the shell to the first critic updates
+  epoch    where the time of a training epoch goes, and peak memory
+  all      everything, into runs/bench.json and docs/performance.md (default)
+
+`twirl bench PART --help` lists the options of a part; `--json` prints one JSON document on stdout.
+"""
+
+
+@dataclasses.dataclass(frozen=True)
+class AllBench:
+    """Run every part in a process of its own; write a JSON file and the tables of a page."""
+
+    json: bool = False
+    """Print one JSON document on stdout, and nothing else."""
+    minutes: float = 9.5
+    """Time for everything; a part that is not done by then is stopped and reported so."""
+    seconds: float | None = None
+    """Length of the measurements of learner, worlds and epoch each, in s; their own by default."""
+    task: str = "stand"
+    """Task of worlds, start-up and epoch."""
+    preset: str = "cpu"
+    """Sizes of start-up and epoch: paper, cpu or debug."""
+    out: Path = Path("runs/bench.json")
+    """All results."""
+    page: Path = Path("docs/performance.md")
+    """Markdown page whose marked section is replaced."""
+
+    def __post_init__(self) -> None:
+        """Check the numbers.
+
+        Raises:
+            ValueError: A value is out of range.
+        """
+        check_range("minutes", self.minutes, 0.1, 600.0)
+        if self.seconds is not None:
+            check_range("seconds", self.seconds, 0.1, 3600.0)
+
+
+def main(argv: list[str]) -> int:
+    """Measure one part, or all of them."""
+    if argv[:1] in (["--help"], ["-h"]):
+        print(USAGE, end="")
+        return 0
+    name, rest = ("all", argv) if not argv or argv[0].startswith("-") else (argv[0], argv[1:])
+    check_choice("part", name, (*PARTS, "all"))
+    return _all(rest) if name == "all" else _part(name, rest)
+
+
+def _part(name: str, argv: list[str]) -> int:
+    """Measure one part and print its table, or its record as JSON."""
+    from twirl_mjx.bench import report
+    from twirl_mjx.bench.measure import only_json_on_stdout
+
+    module: Any = importlib.import_module(f"twirl_mjx.bench.{name}")
+    options = parse(getattr(module, f"{name.capitalize()}Bench"), argv, f"twirl bench {name}")
+    with only_json_on_stdout() as out:
+        record = module.measure(options)
+        if options.json:
+            print(json_text(record), file=out, flush=True)
+            return 0
+    report.print_sheets(report.sheets_of({name: record}), record["machine"])
+    return 0
+
+
+def _all(argv: list[str]) -> int:
+    """Run every part within the time; returns 1 if one failed."""
+    from twirl_mjx.bench import report
+    from twirl_mjx.bench.measure import only_json_on_stdout
+
+    options = parse(AllBench, argv, "twirl bench")
+    page = options.page.read_text(encoding="utf-8")
+    report.replace_section(page, "")  # refuses a page without markers before anything is measured
+    with only_json_on_stdout() as out:
+        results = run_parts(options)
+        options.out.parent.mkdir(parents=True, exist_ok=True)
+        options.out.write_text(json_text(results) + "\n", encoding="utf-8")
+        if options.json:
+            print(json_text(results), file=out, flush=True)
+    parts = results["parts"]
+    sheets = report.sheets_of(parts)
+    report.write_section(options.page, report.markdown(sheets, results["machine"]))
+    if not options.json:
+        report.print_sheets(sheets, results["machine"])
+        say(f"wrote {options.out} and the tables of {options.page}")
+    return 1 if any("error" in record for record in parts.values()) else 0
+
+
+def run_parts(options: AllBench) -> dict[str, Any]:
+    """Run the parts one after another, each in a fresh process with the time that is left."""
+    from twirl_mjx.bench.measure import machine
+
+    began = time.monotonic()
+    result: dict[str, Any] = {"machine": machine(), "parts": {}}
+    for name in PARTS:
+        left = 60 * options.minutes - (time.monotonic() - began)
+        result["parts"][name] = run_part(name, part_arguments(name, options), left)
+    return result | {"minutes": (time.monotonic() - began) / 60}
+
+
+def part_arguments(name: str, options: AllBench) -> list[str]:
+    """Return the options that a part is called with."""
+    words = ["--json"]
+    if options.seconds is not None and name != "startup":
+        words += ["--seconds", str(options.seconds)]
+    if name != "learner":
+        words += ["--task", options.task]
+    if name in ("startup", "epoch"):
+        words += ["--preset", options.preset]
+    return words
+
+
+def run_part(name: str, arguments: list[str], left: float) -> dict[str, Any]:
+    """Run one part; its record, or ``{"part": ..., "error": ...}``.
+
+    Args:
+        name: Part.
+        arguments: Its options.
+        left: s, it is stopped after this time.
+    """
+    if left <= 0:
+        return {"part": name, "error": "no time left (--minutes)"}
+    command = [sys.executable, "-m", "twirl_mjx", "bench", name, *arguments]
+    try:
+        done = subprocess.run(command, stdout=subprocess.PIPE, timeout=left, check=False)
+    except subprocess.TimeoutExpired:
+        return {"part": name, "error": f"stopped after {left:.0f} s (--minutes)"}
+    if done.returncode:
+        return {"part": name, "error": f"ended with status {done.returncode}"}
+    return json.loads(done.stdout)
