@@ -101,16 +101,10 @@ class GymnasiumEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         camera = mujoco.MjvCamera()
         camera.lookat[:] = self._qpos[:3]
         camera.distance, camera.azimuth, camera.elevation = 1.7, 120.0, -14.0
-        if self._renderer is None:
-            try:
-                self._renderer = mujoco.Renderer(model, *FRAME_SIZE)
-            except Exception as error:  # drivers and PyOpenGL fail in many types
-                raise RuntimeError(
-                    "cannot draw in this process: set the environment variable MUJOCO_GL to 'egl' "
-                    f"or 'osmesa' before Python starts ({type(error).__name__}: {error})"
-                ) from error
-        self._renderer.update_scene(data, camera)
-        return self._renderer.render()
+        renderer = self._renderer or _open_renderer(model)
+        self._renderer = renderer
+        renderer.update_scene(data, camera)
+        return renderer.render()
 
     def close(self) -> None:
         """Free the drawing context."""
@@ -124,6 +118,16 @@ class GymnasiumEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         flags = jnp.stack([state.terminated, state.truncated, state.invalid])[:, 0]
         read = (state.next_obs[0], state.reward[0], *flags, state.metrics, state.data.qpos[0])
         return state, read
+
+
+def _open_renderer(model: mujoco.MjModel) -> mujoco.Renderer:
+    try:
+        return mujoco.Renderer(model, *FRAME_SIZE)
+    except Exception as error:  # drivers and PyOpenGL fail in many types
+        raise RuntimeError(
+            "cannot draw in this process: set the environment variable MUJOCO_GL to 'egl' "
+            f"or 'osmesa' before Python starts ({type(error).__name__}: {error})"
+        ) from error
 
 
 def _info(metrics: dict[str, np.ndarray], *, invalid: bool) -> dict[str, Any]:
