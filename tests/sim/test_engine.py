@@ -304,8 +304,9 @@ def test_auto_is_native_on_a_cpu(flat: Scene) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["sloped", "bumpy"])
-def test_engines_agree_on_shaped_ground(kind: scene.SceneKind) -> None:
+@pytest.mark.parametrize(("kind", "tolerance"), [("sloped", 1e-4), ("bumpy", 1e-3)])
+def test_engines_agree_on_shaped_ground(kind: scene.SceneKind, tolerance: float) -> None:
+    """Less well on bumps, where a foot meets several prisms, whose contacts differ in C and MJX."""
     built = build_scene(kind, collision="feet")
     worlds = make_worlds(incline=np.deg2rad([8.0, 4.0, 0.0]), bump_height=[0.05, 0.1, 0.0])
     qpos, qvel, target = moving(0.001)
@@ -313,4 +314,4 @@ def test_engines_agree_on_shaped_ground(kind: scene.SceneKind) -> None:
     qpos[:, 2] -= foot_gaps(built, qpos, worlds).min(axis=1) - 0.001
     args = make_command(target), worlds
     native, mjx = (make_step(built, name)(qpos, qvel, *args) for name in ("native", "mjx"))
-    np.testing.assert_allclose(mjx[0], native[0], atol=1e-4)
+    np.testing.assert_allclose(mjx[0], native[0], atol=tolerance)
