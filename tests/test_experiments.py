@@ -43,6 +43,7 @@ def test_cells_are_the_product(name: str, reduced: bool) -> None:
     grid = load(name, reduced=reduced)
     assert len(grid.drafts) == CELLS[name, reduced]
     assert grid.results_name == (f"{name}_reduced" if reduced else name)
+    assert grid.command == f"make sweep GRID={name}" + (' ARGS="--reduced"' if reduced else "")
 
 
 @pytest.mark.parametrize(("name", "reduced"), BOTH)

@@ -36,7 +36,7 @@ def test_tables_of_a_finished_grid(
     text = (folder / "biped-phi0.5.csv").read_text().splitlines()
     assert text[:3] == [
         "# reduced: all of it",
-        '# command: make sweep GRID=phi ARGS="--reduced"',
+        "# command: twirl sweep phi.py --reduced",
         "# grid: phi_reduced",
     ]
     assert text[3] == "run,task,shift,variant,seed,metric,env_steps,grad_steps,wall_s,value,phi"

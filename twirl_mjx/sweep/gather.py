@@ -63,9 +63,8 @@ def gather(grid: Grid, cells: Sequence[Cell], runs: Path, results: Path) -> list
 
 def notes_of(grid: Grid, finished: int, expected: int) -> list[str]:
     """Return the comment lines of a table."""
-    more = ' ARGS="--reduced"' if grid.reduced else ""
     lines = [f"# reduced: {grid.note}"] if grid.reduced else []
-    lines += [f"# command: make sweep GRID={grid.name}{more}", f"# grid: {grid.results_name}"]
+    lines += [f"# command: {grid.command}", f"# grid: {grid.results_name}"]
     if finished < expected:
         lines.append(f"# incomplete: {finished} of {expected} seeds")
     return lines

@@ -56,6 +56,8 @@ class Grid:
     """Its cells, arms in order, seeds innermost."""
     varied: frozenset[str]
     """Dotted fields that an axis sets."""
+    command: str
+    """Command that runs it."""
 
     @property
     def results_name(self) -> str:
@@ -82,7 +84,9 @@ def load(name: str, *, reduced: bool = False, seeds: Sequence[int] | None = None
             names the block and the entry.
     """
     path = Path(name)
+    command = f"twirl sweep {path.name}" + " --reduced" * reduced
     if path.suffix != ".py":
+        command = f"make sweep GRID={name}" + ' ARGS="--reduced"' * reduced
         known = tuple(sorted(p.stem for p in grids_folder().glob("*.py")))
         if not known:
             raise ValueError(f"no grids in {grids_folder().resolve()}: run from a checkout")
@@ -102,7 +106,7 @@ def load(name: str, *, reduced: bool = False, seeds: Sequence[int] | None = None
         for field in s
     )  # fmt: skip
     note = str(getattr(module, "REDUCED_NOTE", "smaller budgets")) if reduced else ""
-    return Grid(path.stem, reduced, note, tuple(drafts), varied)
+    return Grid(path.stem, reduced, note, tuple(drafts), varied, command)
 
 
 def _module(path: Path) -> ModuleType:
