@@ -153,7 +153,7 @@ def test_missing_peer_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_failing_peer_is_not_hidden(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(learner, "_sbx_python", lambda: Path(sys.executable))
-    with pytest.raises(RuntimeError, match="SBX peer failed: .*No module named"):
+    with pytest.raises(RuntimeError, match=r"SBX peer failed: .*No module named"):
         learner.sbx_samples(LearnerBench(), 0.1)
 
 
@@ -173,9 +173,9 @@ def test_worker_that_dies_is_reported() -> None:
 @pytest.mark.slow
 def test_learner_measured_from_the_shell() -> None:
     sizes = "--obs 5 --action 2 --batch 16 --hidden 16 --utd 2 --seeds 2 --workers 1 --no-sbx"
+    words = f"-m twirl_mjx bench learner --json --seconds 2 --rounds 1 {sizes}".split()
     done = subprocess.run(
-        [sys.executable, "-m", "twirl_mjx", "bench", "learner", "--json", "--seconds", "2"]
-        + ["--rounds", "1", *sizes.split()],
+        [sys.executable, *words],
         capture_output=True,
         text=True,
         timeout=290,

@@ -21,8 +21,12 @@ CHILD = """
 
     assert jax.device_count() == 2
     base = make_config("stand", "debug")
-    config = dataclasses.replace(
-        base, env=dataclasses.replace(base.env, engine="ENGINE", num_envs=4), epoch_env_steps=32
+    config = dataclasses.replace(  # epochs of two vector steps, updates after the first of all
+        base,
+        env=dataclasses.replace(base.env, engine="ENGINE", num_envs=4),
+        droq=dataclasses.replace(base.droq, hidden_sizes=(32,)),
+        warmup_env_steps=4,
+        epoch_env_steps=8,
     )
     env = make_env(config, training=True, threads=1)
 
@@ -48,12 +52,10 @@ CHILD = """
                     metrics_two[name], metrics_one[name], rtol=ERROR, atol=ERROR, err_msg=name
                 )
             for a, b in zip(values(one), values(two), strict=True):
-                if number == 0 and ERROR < 1e-3:  # nothing has been learned yet
-                    np.testing.assert_array_equal(a, b)
                 np.testing.assert_allclose(b, a, rtol=ERROR, atol=ERROR)
             assert two.env.reward.sharding.spec == jax.sharding.PartitionSpec(axis)
         assert epoch_two._cache_size() == 1
-        assert (np.asarray(one.learner.grad_steps) == 32).all()
+        assert (np.asarray(one.learner.grad_steps) == 12).all()
 """
 
 SEEDS = """
@@ -88,7 +90,11 @@ WORLDS = """
 
 
 def run_child(body: str, engine: str, error: float) -> None:
-    """Run a comparison; ``error`` is the largest difference allowed once networks have changed."""
+    """Run a comparison in which numbers may differ by ``error``, relative and absolute.
+
+    A device computes for a part of the seeds or worlds; compiled for other sizes, sums round
+    differently, and contacts amplify that, so the comparison covers 0.2 s of simulated time.
+    """
     code = textwrap.dedent(CHILD) + textwrap.dedent(body)
     child = dict(os.environ)
     child["XLA_FLAGS"] = "--xla_force_host_platform_device_count=2"
@@ -105,18 +111,17 @@ def run_child(body: str, engine: str, error: float) -> None:
 
 
 def test_seeds_on_two_devices() -> None:
-    run_child(SEEDS, "native", 1e-4)
+    run_child(SEEDS, "native", 1e-3)
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(1900)
 def test_worlds_on_two_devices() -> None:
-    run_child(WORLDS, "native", 1e-4)
+    run_child(WORLDS, "native", 1e-3)
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(1900)
 @pytest.mark.parametrize("body", [SEEDS, WORLDS], ids=["seeds", "worlds"])
 def test_mjx_on_two_devices(body: str) -> None:
-    """Compiled for another number of worlds MJX rounds differently, and contacts amplify that."""
-    run_child(body, "mjx", 2e-2)
+    run_child(body, "mjx", 1e-2)

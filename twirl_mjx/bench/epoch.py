@@ -42,7 +42,7 @@ class EpochBench:
 
     json: bool = False
     """Print one JSON document on stdout, and nothing else."""
-    seconds: float = 30.0
+    seconds: float = 24.0
     """Length of all measurements together in s, without compilation."""
     task: str = "stand"
     """Task."""

@@ -44,7 +44,7 @@ class LearnerBench:
 
     json: bool = False
     """Print one JSON document on stdout, and nothing else."""
-    seconds: float = 75.0
+    seconds: float = 60.0
     """Length of all measurements together in s, without compilation."""
     rounds: int = 2
     """Times that everything is measured in turn."""
@@ -231,9 +231,7 @@ def measure(options: LearnerBench) -> Record:
         if reasons["workers"] is None:
             cpus = available_cpus()[: options.num_workers]
             alone = dataclasses.replace(options, workers=0)  # a worker sees one CPU only
-            workers = [
-                stack.enter_context(Worker(cpu, dataclasses.asdict(alone))) for cpu in cpus
-            ]
+            workers = [stack.enter_context(Worker(cpu, dataclasses.asdict(alone))) for cpu in cpus]
         for worker in workers:
             worker.wait_until_ready()
         for number in range(options.rounds):

@@ -10,6 +10,7 @@ from __future__ import annotations
 import csv
 import dataclasses
 import os
+import statistics
 import subprocess
 import sys
 import tempfile
@@ -33,7 +34,7 @@ class StartupBench:
     """Task, trained from scratch."""
     preset: str = "cpu"
     """Sizes: paper, cpu or debug."""
-    repeats: int = 3
+    repeats: int = 2
     """Starts with a filled cache."""
     seconds: float = 300.0
     """s, longest start that is waited for."""
@@ -126,22 +127,24 @@ def measure(options: StartupBench) -> Record:
     with tempfile.TemporaryDirectory(prefix="twirl-startup-") as name:
         root = Path(name)
         cache = root / "cache"
-        times = []
-        for i in range(1 + options.repeats):
-            progress(f"bench startup: {'cold' if i == 0 else f'warm {i} of {options.repeats}'}")
-            folder = root / str(i)
+
+        def start(number: int) -> float:
+            folder = root / str(number)
             folder.mkdir()
-            times.append(start_once(options, cache, folder))
-            if i == 0:
-                cache_bytes = folder_size(cache)
-    warm = sorted(times[1:])
+            return start_once(options, cache, folder)
+
+        progress("bench startup: cold")
+        cold = start(0)
+        cache_bytes = folder_size(cache)
+        progress(f"bench startup: warm, {options.repeats} times")
+        warm = [start(1 + i) for i in range(options.repeats)]
     return {
         "part": "startup",
         "task": options.task,
         "preset": options.preset,
-        "cold_s": times[0],
-        "warm_s": warm[len(warm) // 2],
-        "warm_samples": times[1:],
+        "cold_s": cold,
+        "warm_s": statistics.median(warm),
+        "warm_samples": warm,
         "cache_mb": cache_bytes / 1e6,
         "machine": record_machine,
     }

@@ -136,16 +136,17 @@ _EVERYWHERE = PartitionSpec()
 
 def _world_specs() -> TrainState:
     """Return a prefix tree of specs: worlds divided, everything else on every device."""
-    worlds = PartitionSpec(WORLDS)
+    worlds: Any = PartitionSpec(WORLDS)
+    everywhere: Any = _EVERYWHERE
     return TrainState(
-        learner=_EVERYWHERE,
+        learner=everywhere,
         env=worlds,
-        replay=_EVERYWHERE,
+        replay=everywhere,
         tracker=worlds,
-        key=_EVERYWHERE,
-        env_steps=_EVERYWHERE,
-        inserted=_EVERYWHERE,
-    )  # type: ignore[arg-type]
+        key=everywhere,
+        env_steps=everywhere,
+        inserted=everywhere,
+    )
 
 
 def _named(specs: Any, mesh: Mesh) -> Any:
