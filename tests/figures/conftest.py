@@ -8,6 +8,7 @@ import imageio.v2 as imageio
 import numpy as np
 import pytest
 
+from twirl_mjx.deploy.video import write_video
 from twirl_mjx.figures.report import Media, write_report
 
 CURVES = ["run", "task", "shift", "variant", "seed", "metric", "env_steps", "grad_steps"]
@@ -130,9 +131,7 @@ def report_file(results, tmp_path_factory) -> Path:
     for name in ("twirl", "zero-shot"):
         rows = episode_rows("biped", "icy", name, 0)
         write_csv(root / "results" / "evaluation" / f"biped-{name}.csv", EPISODES, rows)
-    with imageio.get_writer(root / "walk.mp4", fps=20) as writer:
-        for i in range(5):
-            writer.append_data(np.full((48, 64, 3), 40 * i, np.uint8))  # pyright: ignore
+    write_video(root / "walk.mp4", [np.full((48, 64, 3), 40 * i, np.uint8) for i in range(5)])
     imageio.imwrite(root / "scene.png", np.full((40, 60, 3), 128, np.uint8))
     clip = Media(
         root / "walk.mp4", "Biped walks", "A robot on its hind legs", "make render TASK=biped"

@@ -12,6 +12,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import cast
 
 import jax
 import jax.numpy as jnp
@@ -101,7 +102,8 @@ def critic_block(
         next_log_prob,
         dropout.seeds(key, (num_steps, 2, len(config.hidden_sizes))),
     )
-    trees = (state.critic, state.target_critic, state.critic_opt.mu, state.critic_opt.nu)
+    moments = cast(tuple[Params, Params], (state.critic_opt.mu, state.critic_opt.nu))
+    trees = (state.critic, state.target_critic, *moments)
     packed = tuple(packing.pack(tree, config.hidden_sizes) for tree in trees)
 
     def body(carry: tuple, step: tuple) -> tuple[tuple, tuple]:
@@ -161,7 +163,7 @@ def _masks(seeds: jax.Array, rows: int, config: DroqConfig) -> list[jax.Array]:
 
 def _squared_norm(grad: PackedCritic) -> jax.Array:
     """Return the sum of squares of all entries."""
-    return sum((jnp.vdot(leaf, leaf) for leaf in jax.tree.leaves(grad)), jnp.zeros(()))
+    return sum((jnp.sum(jnp.square(leaf)) for leaf in jax.tree.leaves(grad)), jnp.zeros(()))
 
 
 def _adam_polyak(

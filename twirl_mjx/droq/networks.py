@@ -91,7 +91,7 @@ def init_critic(
     """Draw the parameters of an ensemble of critics over inputs of length O + A."""
     module = critic_ensemble(num_critics, hidden_sizes, 0.0, "float32")
     variables = module.init(key, jnp.zeros((1, input_size)), None)
-    return variables["params"]
+    return dict(variables["params"])
 
 
 def init_actor(

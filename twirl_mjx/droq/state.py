@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, cast
 
 import flax.struct
 import jax
@@ -59,9 +59,9 @@ def adam_step(
 ) -> tuple[Any, AdamState]:
     """Take one Adam step (Kingma and Ba 2015, Algorithm 1) with optax."""
     adam = optax.scale_by_adam(b1=ADAM_B1, b2=ADAM_B2, eps=ADAM_EPSILON)
-    updates, opt = adam.update(grads, opt)
+    updates, moments = adam.update(grads, opt)
     new_params = jax.tree.map(lambda p, u: p - learning_rate * u, params, updates)
-    return new_params, AdamState(*opt)
+    return new_params, AdamState(*cast(AdamState, moments))
 
 
 def polyak(target: Any, online: Any, tau: float) -> Any:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import flax.struct
 import jax
+import jax.core
 import jax.numpy as jnp
 
 from twirl_mjx.replay import ring as ring_lib
