@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import dataclasses
+import sys
 import time
 from pathlib import Path
 from typing import Annotated
@@ -107,7 +108,7 @@ def _print_table(title: str, values: dict[str, dict[str, np.ndarray]]) -> None:
             f"{iqm.estimate:.1f} [{iqm.low:.1f}, {iqm.high:.1f}]",
             *(f"{found[m].mean():.3g}" for m in measures),
         )
-    Console(width=None).print(table)
+    Console(width=None if sys.stdout.isatty() else 160).print(table)
 
 
 def _draw(table: Path, figure: Path) -> None:
