@@ -85,7 +85,7 @@ class DroqConfig:
         check_range("droq.discount", self.discount, 0.0, 1.0)
         check_range("droq.learning_rate", self.learning_rate, 1e-8, 1.0)
         check_range("droq.tau", self.tau, 0.0, 1.0)
-        check_range("droq.utd", self.utd, 1e-4, 1000.0)
+        check_range("droq.utd", self.utd, 1e-6, 1000.0)
         check_range("droq.updates_per_block", self.updates_per_block, 1, 100_000)
         check_range("droq.initial_temperature", self.initial_temperature, 1e-6, 100.0)
         check_choice("droq.matmul_dtype", self.matmul_dtype, ("float32", "bfloat16"))
