@@ -1,4 +1,7 @@
-"""Two simulated devices against one; in a child process, because XLA fixes devices at its start."""
+"""Seeds and worlds on a mesh: what goes where, and two simulated devices against one.
+
+Two devices need a child process, because XLA fixes its devices when it starts.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +10,14 @@ import subprocess
 import sys
 import textwrap
 
+import jax
 import pytest
+
+from twirl_mjx.config import TrainConfig
+from twirl_mjx.tasks.registry import make_env
+from twirl_mjx.tasks.vector import VectorEnv
+from twirl_mjx.training import seeds, sharding, state
+from twirl_mjx.training.state import TrainState
 
 CHILD = """
     import dataclasses
@@ -110,14 +120,36 @@ def run_child(body: str, engine: str, error: float) -> None:
     assert done.stdout.endswith("the same\n")
 
 
-def test_seeds_on_two_devices() -> None:
-    run_child(SEEDS, "native", 1e-3)
+@pytest.fixture(scope="module")
+def env(stand_config: TrainConfig) -> VectorEnv:
+    return make_env(stand_config, training=True, threads=1)
+
+
+def test_epochs_keep_the_shapes_of_their_state(stand_config: TrainConfig, env: VectorEnv) -> None:
+    """On a mesh of the devices there are; traced, not compiled."""
+    single = jax.eval_shape(lambda key: state.init(stand_config, env, key, None), jax.random.key(0))
+    epoch = sharding.compile_epoch_worlds(stand_config, env, sharding.device_mesh("worlds"))
+    after, metrics = jax.eval_shape(epoch, single)
+    assert shapes(after) == shapes(single)
+    assert {value.shape for value in metrics.values()} == {()}
+
+    chosen = list(range(2 * jax.device_count()))
+    batch = jax.eval_shape(lambda: seeds.init_seeds(stand_config, env, chosen, None))
+    epoch = sharding.compile_epoch_seeds(stand_config, env, sharding.device_mesh("seeds"))
+    after, metrics = jax.eval_shape(epoch, batch)
+    assert shapes(after) == shapes(batch)
+    assert {value.shape for value in metrics.values()} == {(len(chosen),)}
+
+
+def shapes(tree: TrainState) -> list[tuple[tuple[int, ...], str]]:
+    return [(leaf.shape, str(leaf.dtype)) for leaf in jax.tree.leaves(tree)]
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(1900)
-def test_worlds_on_two_devices() -> None:
-    run_child(WORLDS, "native", 1e-3)
+@pytest.mark.parametrize("body", [SEEDS, WORLDS], ids=["seeds", "worlds"])
+def test_native_on_two_devices(body: str) -> None:
+    run_child(body, "native", 1e-3)
 
 
 @pytest.mark.slow
