@@ -13,6 +13,7 @@ from typing import Any
 
 import pytest
 
+from twirl_mjx.sweep import scheduler
 from twirl_mjx.sweep.scheduler import Progress, run_all
 from twirl_mjx.sweep.worker import Job, claim_core, run_job
 
@@ -88,6 +89,33 @@ def test_a_lost_worker_is_survived(tmp_path: Path, here_executor: Any) -> None:
     table = run([make(tmp_path, "a"), make(tmp_path, "b")], here_executor(lost=("a",)))
     assert (table["a"].state, table["b"].state) == ("failed", "done")
     assert table["a"].reason == "worker lost: ConnectionError"
+
+
+class BusyRay:
+    """Starts at the n-th attempt."""
+
+    def __init__(self, needed: int) -> None:
+        self.needed, self.calls = needed, 0
+
+    def init(self, **options: Any) -> None:
+        self.calls += 1
+        if self.calls < self.needed:
+            raise Exception("timed out during startup")
+
+    def shutdown(self) -> None:
+        pass
+
+
+def test_a_busy_machine_gets_several_attempts_to_start_ray() -> None:
+    ray = BusyRay(needed=3)
+    scheduler._start(ray, {"num_cpus": 1})
+    assert ray.calls == 3
+    with pytest.raises(RuntimeError, match="did not start in 4 attempts: timed out"):
+        scheduler._start(BusyRay(needed=9), {"num_cpus": 1})
+    joined = BusyRay(needed=2)
+    with pytest.raises(RuntimeError, match="in 1 attempts"):
+        scheduler._start(joined, {"address": "10.0.0.1:6379"})
+    assert joined.calls == 1
 
 
 def test_nothing_starts_after_a_stop(tmp_path: Path, here_executor: Any) -> None:

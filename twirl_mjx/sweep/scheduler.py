@@ -18,6 +18,8 @@ State = Literal["waiting", "running", "done", "failed", "blocked", "stopped"]
 
 OBJECT_STORE_BYTES = 80 * 2**20
 """Ray's smallest object store; jobs hand over a few words."""
+START_ATTEMPTS = 4
+"""Attempts to start Ray."""
 NO_RETRY = 2
 """Exit status of unusable arguments: another attempt would end the same way."""
 STOPPED = 130
@@ -80,6 +82,7 @@ class RayExecutor:
 
         Raises:
             ValueError: More GPUs are asked for than there are.
+            RuntimeError: Ray does not start, or there is no cluster at the address.
         """
         import ray
 
@@ -91,9 +94,7 @@ class RayExecutor:
                 "include_dashboard": False,
                 "object_store_memory": OBJECT_STORE_BYTES,
             }
-        ray.init(
-            log_to_driver=False, configure_logging=False, logging_level=logging.ERROR, **options
-        )
+        _start(ray, options)
         self._workers = workers
         there = float(ray.cluster_resources().get("GPU", 0))
         self._gpus = (1.0 if there else 0.0) if gpus is None else gpus
@@ -142,6 +143,25 @@ class RayExecutor:
     def stop(self, handle: Any) -> None:
         """Interrupt the task, which asks its child to stop."""
         self._ray.cancel(handle, force=False)
+
+
+def _start(ray: Any, options: dict[str, Any]) -> None:
+    """Start or join Ray; a busy machine gets several attempts, as Ray itself gives it 30 s.
+
+    Raises:
+        RuntimeError: It did not work.
+    """
+    quiet = {"log_to_driver": False, "configure_logging": False, "logging_level": logging.ERROR}
+    attempts = 1 if options.get("address") else START_ATTEMPTS
+    for left in reversed(range(attempts)):
+        try:
+            ray.init(**quiet, **options)
+        except Exception as error:  # Ray raises the bare class here
+            ray.shutdown()
+            if not left:
+                raise RuntimeError(f"Ray did not start in {attempts} attempts: {error}") from error
+        else:
+            return
 
 
 @contextlib.contextmanager
