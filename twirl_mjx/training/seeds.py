@@ -4,8 +4,8 @@ Every product of the learner then covers all seeds at once, and the native engin
 of all seeds in one call. ``sharding`` spreads the same axis over devices.
 
 What equals what: a seed of a batch draws the same random numbers and steps the same physics as
-the same seed alone, so both agree bit for bit until the first critic update. From there on they
-agree to float32 rounding, because a batched matrix product sums in another order.
+the same seed alone. Both agree to float32 rounding, because a program compiled for another shape,
+and a batched matrix product, sum in another order; contacts amplify such differences in time.
 """
 
 from __future__ import annotations
