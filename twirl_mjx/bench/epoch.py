@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 
 from twirl_mjx.bench.measure import Chain, Record, machine, progress, sample_rates, summary
-from twirl_mjx.config import TASKS, TrainConfig, check_choice, check_range
+from twirl_mjx.config import TASKS, DroqConfig, TrainConfig, check_choice, check_range
 from twirl_mjx.droq import learner as droq
 from twirl_mjx.presets import PRESETS, make_config
 from twirl_mjx.replay import mixed, ring
@@ -83,19 +83,12 @@ def make_parts(config: TrainConfig, env: VectorEnv, state: TrainState) -> dict[s
 
     Every state is a pair of what the part changes and a key it draws from.
     """
+    return _world_parts(env, state) | _learner_parts(config.droq, state)
+
+
+def _world_parts(env: VectorEnv, state: TrainState) -> dict[str, Any]:
+    """Return the parts that move the worlds and store what happened."""
     shape = (env.num_envs, env.action_size)
-    learner_config = config.droq
-
-    def minibatches(replay: mixed.MixedReplay, key: jax.Array) -> Any:
-        return mixed.sample(
-            replay,
-            key,
-            num_minibatches=learner_config.updates_per_block,
-            batch_size=learner_config.batch_size,
-            phi=0.0,
-        )
-
-    fixed = jax.jit(minibatches)(state.replay, jax.random.key(1))
     command = jax.jit(jax.vmap(actuation.motor_command))(
         state.env.world.motors, state.env.data.ctrl
     )
@@ -122,6 +115,23 @@ def make_parts(config: TrainConfig, env: VectorEnv, state: TrainState) -> dict[s
         online, key = carry
         return ring.insert(online, transition, jnp.ones(env.num_envs, bool)), key
 
+    return {
+        "physics": (physics, state.env.data),
+        "worlds": (worlds, state.env),
+        "act": (act, state.env.obs),
+        "insert": (insert, state.replay.online),
+    }
+
+
+def _learner_parts(config: DroqConfig, state: TrainState) -> dict[str, Any]:
+    """Return the parts that draw minibatches and learn from them."""
+
+    def minibatches(replay: mixed.MixedReplay, key: jax.Array) -> Any:
+        count, rows = config.updates_per_block, config.batch_size
+        return mixed.sample(replay, key, num_minibatches=count, batch_size=rows, phi=0.0)
+
+    fixed = jax.jit(minibatches)(state.replay, jax.random.key(1))
+
     def sample(carry: Any) -> Any:
         _, key = carry
         key, sample_key = jax.random.split(key)
@@ -130,19 +140,15 @@ def make_parts(config: TrainConfig, env: VectorEnv, state: TrainState) -> dict[s
     def update(carry: Any) -> Any:
         learner, key = carry
         key, update_key = jax.random.split(key)
-        return droq.update(learner, learner_config, fixed, update_key)[0], key
+        return droq.update(learner, config, fixed, update_key)[0], key
 
     def actor(carry: Any) -> Any:
         learner, key = carry
         key, noise_key, actor_key = jax.random.split(key, 3)
         noise = jax.random.normal(noise_key, fixed.action.shape[1:])
-        return droq.actor_step(learner, learner_config, fixed.obs[-1], noise, actor_key)[0], key
+        return droq.actor_step(learner, config, fixed.obs[-1], noise, actor_key)[0], key
 
     return {
-        "physics": (physics, state.env.data),
-        "worlds": (worlds, state.env),
-        "act": (act, state.env.obs),
-        "insert": (insert, state.replay.online),
         "sample": (sample, fixed),
         "update": (update, state.learner),
         "actor": (actor, state.learner),
