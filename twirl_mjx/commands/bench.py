@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import importlib
 import json
@@ -78,7 +79,8 @@ def _part(name: str, argv: list[str]) -> int:
     from twirl_mjx.bench import report
     from twirl_mjx.bench.measure import only_json_on_stdout
 
-    module: Any = importlib.import_module(f"twirl_mjx.bench.{name}")
+    with contextlib.redirect_stdout(sys.stderr):  # mujoco-mjx prints while it is imported
+        module: Any = importlib.import_module(f"twirl_mjx.bench.{name}")
     options = parse(getattr(module, f"{name.capitalize()}Bench"), argv, f"twirl bench {name}")
     with only_json_on_stdout() as out:
         record = module.measure(options)
