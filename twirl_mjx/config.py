@@ -159,10 +159,16 @@ class ImitateConfig:
 
     clip: str = "leap"
     """``leap`` (ours) or the path of a clip file."""
+    standing_fraction: float = 0.0
+    """Share of episodes started at rest on four feet, as the episodes of ``hurdles`` are."""
     max_root_error: float = 1.0
     """m, an episode ends beyond this distance from the reference root."""
     max_root_angle: float = 1.5707963
     """rad, an episode ends beyond this rotation from the reference root."""
+
+    def __post_init__(self) -> None:
+        """Check the share, or raise ValueError."""
+        check_range("imitate.standing_fraction", self.standing_fraction, 0.0, 1.0)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -10,6 +10,7 @@ from twirl_mjx.config import (
     DroqConfig,
     EnvConfig,
     EvalConfig,
+    ImitateConfig,
     ReplayConfig,
     StandConfig,
     TrainConfig,
@@ -25,6 +26,7 @@ def _paper(task: str) -> TrainConfig:
         task=task,
         variant="twirl" if sourced else "scratch",
         stand=StandConfig(height_of="front_feet", risen_fraction=0.0),
+        imitate=ImitateConfig(standing_fraction=0.2),
     )
 
 

@@ -239,6 +239,19 @@ def test_episodes_start_anywhere_on_the_reference(harness: Harness) -> None:
     np.testing.assert_allclose(placed, np.maximum(under, 0.0), atol=1e-6)
 
 
+def test_a_share_of_the_episodes_starts_at_rest(config: TrainConfig) -> None:
+    half = dataclasses.replace(config.imitate, standing_fraction=0.5)
+    task = Imitate(dataclasses.replace(config, imitate=half))
+    keys = jax.random.split(jax.random.key(2), 200)
+    start = jax.jit(jax.vmap(lambda key: task.start(key, FLAT, NOMINAL)))(keys)
+    rest = np.all(np.asarray(start.qvel) == 0.0, axis=1)
+    assert 70 < rest.sum() < 130  # 100 +- 4 standard deviations
+    assert np.all((np.asarray(start.memory.start_time) == task.observer.standing_time)[rest])
+    joints = np.asarray(start.qpos)[rest, 7:] - a1.DEFAULT_POSE
+    assert np.abs(joints).max() <= base.START_NOISE + 1e-6
+    np.testing.assert_allclose(np.asarray(start.qvel)[~rest, 0], SPEED, rtol=1e-4)
+
+
 def test_early_termination(harness: Harness) -> None:
     memory = harness.at(0.6)  # highest point, legs straight
     qpos, qvel = map(np.asarray, harness.reference(memory))

@@ -20,6 +20,8 @@ from twirl_mjx.tasks.imitate import (
     ImitateMemory,
     ImitateObserver,
     facing_x,
+    load_clip,
+    standing_time,
 )
 from twirl_mjx.tasks.observations import layout_size, layout_slices
 
@@ -134,14 +136,16 @@ def test_the_observer_serves_a_foreign_task(harness: Harness) -> None:
     qvel = jnp.zeros((2, 18))
     reference = jax.jit(jax.vmap(observer.reference))
     memory = jax.jit(jax.vmap(observer.init))(qpos, qvel)
-    np.testing.assert_array_equal(observer.time(memory), 0.0)
+    np.testing.assert_allclose(observer.time(memory), observer.standing_time)
     np.testing.assert_allclose(reference(memory)[0][:, :2], qpos[:, :2], atol=1e-6)
     push = jax.jit(jax.vmap(observer.push))
     for _ in range(CYCLE_STEPS):
         memory = push(memory, qpos, qvel, jnp.zeros((2, 12)))
     # The robots stood still for a cycle: the reference came back to them.
-    np.testing.assert_allclose(observer.time(memory), CYCLE, rtol=1e-6)
-    np.testing.assert_allclose(reference(memory)[0][:, :2], qpos[:, :2], atol=1e-5)
+    np.testing.assert_allclose(observer.time(memory), observer.standing_time + CYCLE, rtol=1e-6)
+    behind = SPEED * observer.standing_time  # it came back when the clip looped, a while ago
+    np.testing.assert_allclose(reference(memory)[0][:, 0], qpos[:, 0] + behind, atol=1e-5)
+    np.testing.assert_allclose(reference(memory)[0][:, 1], qpos[:, 1], atol=1e-5)
     obs = jax.jit(jax.vmap(observer.observe))(memory, jnp.zeros((2, 2)), qpos, qvel)
     np.testing.assert_allclose(obs[0], obs[1], atol=1e-5)
 
@@ -152,3 +156,23 @@ def test_clips_are_turned_to_face_forward() -> None:
     np.testing.assert_allclose(clip.cycle_displacement, [SPEED * CYCLE, 0.0, 0.0], atol=1e-9)
     straight = synthetic_clip()
     np.testing.assert_allclose(facing_x(straight).qpos, straight.qpos, atol=1e-9)
+
+
+def test_a_robot_at_rest_joins_the_clip_where_all_feet_are_down_and_it_is_slowest() -> None:
+    clip = synthetic_clip()
+    flat = np.tile(clip.qpos[:1], (5, 1))
+    x = np.array([0.0, 0.3, 0.5, 0.9, 1.5])
+    level = dataclasses.replace(
+        clip,
+        root_pos=np.stack([x, 0 * x, flat[:, 2]], axis=1),
+        root_quat=flat[:, 3:7],
+        joint_pos=flat[:, 7:],
+        frame_duration=0.1,
+    )
+    assert standing_time(level) == pytest.approx(0.1)
+
+
+def test_the_shipped_leap_is_joined_crouching_with_a_run_up_ahead() -> None:
+    clip = load_clip("leap")
+    time = standing_time(clip)
+    assert 0.3 * clip.cycle_duration < time < 0.5 * clip.cycle_duration

@@ -89,7 +89,9 @@ class Scene:
     @functools.cached_property
     def mjx_model(self) -> mjx.Model:
         """The model on the device."""
-        return mjx.put_model(self.mj_model)
+        # First asked for inside a trace, it must hold arrays all the same: it is kept.
+        with jax.ensure_compile_time_eval():
+            return mjx.put_model(self.mj_model)
 
 
 def unit_bumps() -> np.ndarray:

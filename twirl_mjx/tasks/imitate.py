@@ -2,7 +2,8 @@
 
 Observation [160]: ``LAYOUT``. Action [12] in [-1, 1]. Reward: the five terms of ``WEIGHTS`` (paper
 Table 2), 1 for a perfect tracker. Episodes start on the reference at a random phase, with its
-velocities. Whenever the clip loops, the reference moves to where the robot is (root xy only).
+velocities; a share of them starts at rest on four feet instead, as episodes of other tasks do.
+Whenever the clip loops, the reference moves to where the robot is (root xy only).
 Terminates when the root is ``max_root_error`` or ``max_root_angle`` away from the reference, or
 anything but the feet touches the ground. The reference lives on flat ground; on other ground its
 height is taken as a height over the ground under the robot.
@@ -22,7 +23,7 @@ from scipy.spatial.transform import Rotation
 from twirl_mjx.assets import asset_path
 from twirl_mjx.config import TrainConfig
 from twirl_mjx.motion.clip import Clip, headings, sample
-from twirl_mjx.motion.formats import read_clip
+from twirl_mjx.motion.formats import foot_paths, read_clip
 from twirl_mjx.sim import a1, frames, kinematics
 from twirl_mjx.sim.dynamics import Dynamics
 from twirl_mjx.sim.scene import CONTROL_DT, CollisionSet, Scene
@@ -43,6 +44,9 @@ TARGET_STEPS = (1, 2, 7, 20)
 
 FLIGHT_STEPS = 4
 """Control steps in a row with all feet off the ground (at least 0.15 s) that make a flight."""
+
+STANDING_TOLERANCE = 0.005
+"""m, poses whose highest foot is this little above the lowest such pose are as good to start in."""
 
 LAYOUT: tuple[Entry, ...] = (
     *(
@@ -98,6 +102,17 @@ def facing_x(clip: Clip) -> Clip:
     )
 
 
+def standing_time(clip: Clip) -> float:
+    """Return the time in s at which a robot at rest best joins the clip.
+
+    That is the frame with all feet lowest; of several such frames, the one the root leaves slowest.
+    """
+    highest_foot = foot_paths(clip)[:-1, :, 2].max(axis=1)
+    speed = np.linalg.norm(np.diff(clip.root_pos[:, :2], axis=0), axis=1)
+    standing = highest_foot <= highest_foot.min() + STANDING_TOLERANCE
+    return float(np.where(standing, speed, np.inf).argmin() * clip.frame_duration)
+
+
 def to_heading(quat: jax.Array, yaw: jax.Array) -> jax.Array:
     """Return orientations [..., 4] as seen from the heading ``yaw`` in rad, with w >= 0."""
     turned = frames.multiply(frames.from_yaw(-yaw), quat)
@@ -131,7 +146,7 @@ class ImitateMemory(flax.struct.PyTreeNode):
 class ImitateObserver:
     """A 3-step history, and where the reference is going, seen from the robot.
 
-    In a foreign task, the reference starts with the clip's first frame where the robot stands.
+    In a foreign task, where the robot begins at rest, the reference starts at ``standing_time``.
     """
 
     def __init__(self, clip: Clip) -> None:
@@ -140,10 +155,12 @@ class ImitateObserver:
         self.clip = clip.to_arrays()
         self.duration = clip.cycle_duration
         """s, length of a cycle."""
+        self.standing_time = standing_time(clip)
+        """s, clip time at which a robot at rest starts."""
 
     def init(self, qpos: jax.Array, qvel: jax.Array) -> ImitateMemory:
-        """Start the clip at its first frame, at the robot's place."""
-        return self.init_at(jnp.zeros((), jnp.float32), qpos, qvel)
+        """Start the clip at ``standing_time``, at the robot's place."""
+        return self.init_at(jnp.asarray(self.standing_time, jnp.float32), qpos, qvel)
 
     def init_at(self, time: jax.Array, qpos: jax.Array, qvel: jax.Array) -> ImitateMemory:
         """Start the clip at ``time`` in s, at the robot's place."""
@@ -237,8 +254,11 @@ class Imitate:
         self.observer = ImitateObserver(load_clip(config.imitate.clip))
 
     def start(self, key: jax.Array, scene: Scene, dynamics: Dynamics) -> base.Start:
-        """Start on the reference; phase = U(0, cycle)."""
-        place_key, phase_key = jax.random.split(key)
+        """Start on the reference, or at rest in a share ``standing_fraction`` of the episodes.
+
+        phase = U(0, cycle); standing_time from rest.
+        """
+        place_key, phase_key, pose_key, standing_key = jax.random.split(key, 4)
         phase = jax.random.uniform(phase_key, maxval=self.observer.duration)
         xy = base.start_xy(place_key, scene)
         qpos, qvel = sample(self.observer.clip, phase)
@@ -246,10 +266,15 @@ class Imitate:
         endpoints = kinematics.forward(qpos).endpoints
         lowest = jnp.min(base.clearances(scene, dynamics, endpoints))
         qpos = qpos.at[2].add(jnp.maximum(-lowest, 0.0))
+        if self._config.imitate.standing_fraction > 0.0:
+            rest, still = base.start_on_feet(pose_key, scene, dynamics)
+            take = jax.random.uniform(standing_key) < self._config.imitate.standing_fraction
+            qpos, qvel = jnp.where(take, rest, qpos), jnp.where(take, still, qvel)
+            phase = jnp.where(take, jnp.float32(self.observer.standing_time), phase)
         return base.Start(
             qpos=qpos,
             qvel=qvel,
-            goal=xy,
+            goal=qpos[:2],
             memory=self.observer.init_at(phase, qpos, qvel),
             task=ImitateState(
                 airborne_steps=jnp.zeros((), jnp.int32),

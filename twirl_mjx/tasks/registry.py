@@ -48,7 +48,7 @@ def make_env(
     Args:
         config: Task, shift and options.
         training: Start and cut episodes as configured for training (``stand.risen_fraction``,
-            ``env.train_episode_length``), else as the task says.
+            ``imitate.standing_fraction``, ``env.train_episode_length``), else as the task says.
         num_envs: Worlds, ``config.env.num_envs`` by default.
         scene_kind: Ground, that of the config's shift by default.
         threads: Host threads of the native engine, all by default.
@@ -57,6 +57,7 @@ def make_env(
         config = dataclasses.replace(
             config,
             stand=dataclasses.replace(config.stand, risen_fraction=0.0),
+            imitate=dataclasses.replace(config.imitate, standing_fraction=0.0),
             env=dataclasses.replace(config.env, train_episode_length=None),
         )
     task = make_task(config)
