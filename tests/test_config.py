@@ -8,8 +8,8 @@ import json
 import pytest
 
 from twirl_mjx import config_json
-from twirl_mjx.config import SHIFTS as SHIFT_NAMES
 from twirl_mjx.config import (
+    SCRIPTED_SOURCES,
     SOURCE_OF,
     TASKS,
     DroqConfig,
@@ -17,6 +17,7 @@ from twirl_mjx.config import (
     ReplayConfig,
     TrainConfig,
 )
+from twirl_mjx.config import SHIFTS as SHIFT_NAMES
 from twirl_mjx.presets import PRESETS, make_config
 from twirl_mjx.sim.dynamics import SHIFTS
 
@@ -28,7 +29,8 @@ def test_every_preset_builds_and_gives_whole_updates(task: str, preset: str) -> 
     assert config.task == task
     assert config.updates_per_step == pytest.approx(config.droq.utd * config.env.num_envs)
     assert config.blocks_per_step * config.droq.updates_per_block == config.updates_per_step
-    assert config.variant == ("twirl" if task in SOURCE_OF else "scratch")
+    sourced = task in SOURCE_OF or config.source in SCRIPTED_SOURCES
+    assert config.variant == ("twirl" if sourced else "scratch")
     assert make_config(task, preset) == config
     hash(config)
 

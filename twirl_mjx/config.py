@@ -1,7 +1,6 @@
 """Configuration as frozen dataclasses, checked when built, long before anything is compiled.
 
-Defaults are the paper's numbers; ``presets.make_config`` applies a preset and ``config_json``
-reads and writes configs.
+Defaults are the paper's numbers; see ``presets.make_config`` and ``config_json``.
 """
 
 from __future__ import annotations
@@ -16,6 +15,8 @@ TASKS = ("stand", "biped", "imitate", "hurdles")
 SHIFTS = ("none", "bumpy", "icy", "weakened", "sloped", "gravity")
 SOURCE_OF = {"biped": "stand", "hurdles": "imitate"}
 """Task whose trained policy is the default source of another task."""
+SCRIPTED_SOURCES = ("trot", "bound", "zero", "random", "clip")
+"""Sources nobody trained, by name; ``clip`` plays the actions planned for ``imitate.clip``."""
 
 
 def check_choice(what: str, value: str, choices: tuple[str, ...]) -> None:
@@ -249,9 +250,9 @@ class TrainConfig:
     shift_strength: float = 1.0
     """0 is nominal, 1 the paper's value."""
     variant: Variant = "twirl"
-    """scratch, twirl, twirl+weights, weights or zero-shot; stand and imitate have no source."""
+    """scratch, twirl, twirl+weights, weights or zero-shot."""
     source: str = "auto"
-    """auto (shipped policy, else train it), train, a scripted policy's name, or a policy file."""
+    """auto (shipped policy, else train it), train, trot, bound, zero, random, clip, or a file."""
     seed: int = 0
     """Random seed of the run."""
     total_env_steps: int = 1_000_000

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
@@ -172,3 +173,13 @@ def test_options() -> None:
 def test_step_that_does_not_divide_is_refused(sim_dt: float, nearest: str) -> None:
     with pytest.raises(ValueError, match=rf"{sim_dt} s does not divide.*nearest: {nearest}"):
         SimOptions(sim_dt=sim_dt)
+
+
+def test_the_device_model_asked_for_in_a_trace_serves_the_next_one() -> None:
+    built = build_scene("flat", collision="feet")
+
+    def gravity(scale: jax.Array) -> jax.Array:
+        return scale * built.mjx_model.opt.gravity
+
+    for function in (jax.jit(gravity), jax.jit(lambda scale: gravity(scale) + 0.0)):
+        np.testing.assert_allclose(function(jnp.float32(2.0)), [0.0, 0.0, -19.62], rtol=1e-6)

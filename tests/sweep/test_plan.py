@@ -51,12 +51,17 @@ def test_scratch_and_scripted_need_nothing(tmp_path: Path) -> None:
     assert (cell.needs, cell.source, cell.config.source) == ((), "trot", "trot")
 
 
-def test_scripted_names_are_the_policies() -> None:
-    from twirl_mjx.policies.scripted import SCRIPTED
+def test_a_source_may_have_a_scripted_source_itself(tmp_path: Path) -> None:
+    draft = Draft("", "cpu", make_config("hurdles", "cpu"), ())
+    imitate, hurdles = resolve(draft, tmp_path).values()
+    assert (imitate.config.task, imitate.config.source, imitate.needs) == ("imitate", "clip", ())
+    assert hurdles.needs == (imitate.name,)
+
+
+def test_file_names_are_those_of_training() -> None:
     from twirl_mjx.training.loop import EVAL_CSV
     from twirl_mjx.training.metrics import CSV_NAME
 
-    assert set(plan.SCRIPTED) == set(SCRIPTED)
     assert (plan.EVAL_CSV, plan.METRICS_CSV) == (EVAL_CSV, CSV_NAME)
 
 

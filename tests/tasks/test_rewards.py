@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -86,3 +87,21 @@ def test_joint_calm() -> None:
 @pytest.mark.parametrize(("error", "value"), [(0.0, 1.0), (1.0, 0.3678794), (2.0, 0.1353353)])
 def test_kernel(error: float, value: float) -> None:
     assert float(rewards.kernel(jnp.float32(error))) == pytest.approx(value)
+
+
+def test_tracking_terms() -> None:
+    def close(got: jax.Array, want: float) -> None:
+        assert float(got) == pytest.approx(want, abs=1e-6)
+
+    dq = jnp.zeros(12).at[0].set(0.3).at[7].set(-0.4)  # sum of squares 0.25
+    close(rewards.joint_tracking(dq), 0.286505)
+    close(rewards.joint_tracking(jnp.zeros(12)), 1.0)
+    close(rewards.joint_vel_tracking(10.0 * dq), 0.082085)
+    dx = jnp.array([0.1, 0.0, -0.2])
+    close(rewards.root_tracking(dx, jnp.array(0.0)), 0.367879)
+    close(rewards.root_tracking(jnp.zeros(3), jnp.array(0.5)), 0.082085)
+    close(rewards.root_tracking(dx, jnp.array(0.5)), 0.030197)
+    close(rewards.root_vel_tracking(jnp.array([0.5, 0, 0]), jnp.zeros(3)), 0.606531)
+    close(rewards.root_vel_tracking(jnp.zeros(3), jnp.array([0, 1.0, 2.0])), 0.367879)
+    feet = jnp.zeros((4, 3)).at[0, 0].set(0.1).at[3, 2].set(0.1)
+    close(rewards.foot_tracking(feet), 0.449329)

@@ -141,11 +141,31 @@ def epoch_sheet(record: Record) -> Sheet:
     return Sheet("One training epoch", ("part", "ms", "share"), tuple(rows), note)
 
 
+def forms_sheet(record: Record) -> Sheet:
+    """Lay out the returns of both forms of the learner, a row per quarter of the run."""
+
+    def text(values: Sequence[float]) -> str:
+        return f"{sum(values) / len(values):.1f} ({min(values):.1f} to {max(values):.1f})"
+
+    rows = tuple(
+        (str(i + 1), text(part["fast"]), text(part["plain"]), "yes" if part["overlap"] else "no")
+        for i, part in enumerate(record["quarters"])
+    )
+    note = (
+        f"mean episode return over {record['seeds']} seeds (range); {record['task']}, preset"
+        f" {record['preset']}, {record['env_steps']:,} transitions and"
+        f" {record['critic_updates']:,} critic updates of every seed, in"
+        f" {record['wall_s']['fast']:.0f} s fast and {record['wall_s']['plain']:.0f} s plain"
+    )
+    return Sheet("Both forms of the learner", ("quarter", "fast", "plain", "overlap"), rows, note)
+
+
 SHEETS: dict[str, Callable[[Record], Sheet]] = {
     "learner": learner_sheet,
     "worlds": worlds_sheet,
     "startup": startup_sheet,
     "epoch": epoch_sheet,
+    "forms": forms_sheet,
 }
 
 

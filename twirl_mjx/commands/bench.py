@@ -1,4 +1,4 @@
-"""``twirl bench [learner|worlds|startup|epoch|all]``."""
+"""``twirl bench [learner|worlds|startup|epoch|forms|all]``."""
 
 from __future__ import annotations
 
@@ -18,6 +18,9 @@ from twirl_mjx.config import check_choice, check_range
 PARTS = ("learner", "startup", "epoch", "worlds")
 """Worlds last: they leave out rows when the time is up."""
 
+ALONE = ("forms",)
+"""Parts that `all` leaves out because they take longer than all others together."""
+
 ROW_S = 75.0
 """s, longest that a row of worlds is expected to take, compilation included."""
 
@@ -28,6 +31,7 @@ parts:
   worlds   control steps per second, beside the bare physics
   startup  seconds from the shell to the first critic updates
   epoch    where the time of a training epoch goes, and peak memory
+  forms    learning curves with the fast and the plain form of the learner (minutes; not in `all`)
   all      everything, into runs/bench.json and docs/performance.md (default)
 
 `twirl bench PART --help` lists the options of a part; `--json` prints one JSON document on stdout.
@@ -70,7 +74,7 @@ def main(argv: list[str]) -> int:
         print(USAGE, end="")
         return 0
     name, rest = ("all", argv) if not argv or argv[0].startswith("-") else (argv[0], argv[1:])
-    check_choice("part", name, (*PARTS, "all"))
+    check_choice("part", name, (*PARTS, *ALONE, "all"))
     return _all(rest) if name == "all" else _part(name, rest)
 
 

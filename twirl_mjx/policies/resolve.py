@@ -9,11 +9,13 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from twirl_mjx.config import TrainConfig
+from twirl_mjx.config import SCRIPTED_SOURCES, TrainConfig
 from twirl_mjx.policies import scripted
+from twirl_mjx.policies.clip import ClipPolicy
 from twirl_mjx.policies.function import from_policy
 from twirl_mjx.policies.learned import NumpyPolicy, load_policy
 from twirl_mjx.policies.source import LearnedSource
+from twirl_mjx.tasks.imitate import load_clip
 from twirl_mjx.tasks.registry import make_task
 from twirl_mjx.types import SourcePolicy
 
@@ -40,8 +42,8 @@ def resolve_policy(name: str, config: TrainConfig) -> ResolvedPolicy:
         FileNotFoundError: Nothing to load there.
         PolicyFileError: The file is no policy.
     """
-    if name in scripted.SCRIPTED:
-        return ResolvedPolicy(scripted.get_scripted(name), f"scripted {name}", None)
+    if name in SCRIPTED_SOURCES:
+        return ResolvedPolicy(_scripted(name, config), f"scripted {name}", None)
     loaded = load_policy(Path(name))
     header = getattr(loaded, "header", None)
     task = header.task if header is not None else None
@@ -50,3 +52,9 @@ def resolve_policy(name: str, config: TrainConfig) -> ResolvedPolicy:
     actor = jax.tree.map(jnp.asarray, dict(loaded.actor_params))
     observer = make_task(dataclasses.replace(config, task=loaded.header.task)).observer
     return ResolvedPolicy(LearnedSource(actor, observer), name, task, loaded)
+
+
+def _scripted(name: str, config: TrainConfig) -> SourcePolicy:
+    if name == "clip":
+        return ClipPolicy(load_clip(config.imitate.clip))
+    return scripted.get_scripted(name)

@@ -17,14 +17,13 @@ from typing import Literal
 
 from twirl_mjx import config_json
 from twirl_mjx.assets import asset_path
-from twirl_mjx.config import SOURCE_OF, TrainConfig
+from twirl_mjx.config import SCRIPTED_SOURCES, SOURCE_OF, TrainConfig
 from twirl_mjx.presets import make_config
 from twirl_mjx.sweep.grid import Draft, Grid, configure
 from twirl_mjx.training import rundir
 
 EVAL_CSV = "eval.csv"
 METRICS_CSV = "metrics.csv"
-SCRIPTED = ("trot", "bound", "zero", "random")
 
 Status = Literal["finished", "in use", "cut off", "missing"]
 
@@ -117,7 +116,7 @@ def _source_of(
     config = draft.config
     if config.variant == "scratch":
         return "auto", "auto", ()
-    if config.source in SCRIPTED:
+    if config.source in SCRIPTED_SOURCES:
         return config.source, config.source, ()
     if config.source not in ("auto", "train"):
         path = Path(config.source)

@@ -19,9 +19,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from twirl_mjx.assets import asset_path
-from twirl_mjx.config import SOURCE_OF, TrainConfig
+from twirl_mjx.config import SCRIPTED_SOURCES, SOURCE_OF, TrainConfig
 from twirl_mjx.droq.state import DroqState
-from twirl_mjx.policies import scripted
 from twirl_mjx.policies.learned import NumpyPolicy
 from twirl_mjx.policies.resolve import resolve_policy
 from twirl_mjx.presets import PRESETS, make_config
@@ -69,10 +68,11 @@ def run(config: TrainConfig, preset: str, runs_dir: Path, name: str | None, say:
         RunBusyError: Another process works in the run directory.
     """
     run_dir = runs_dir / (name or rundir.default_name(config, preset))
-    if config.task not in SOURCE_OF and config.shift == "none" and config.variant != "scratch":
+    needs_source = config.variant != "scratch" and config.shift == "none"
+    if needs_source and config.task not in SOURCE_OF and config.source in ("auto", "train"):
         raise ValueError(
-            f"task {config.task} has no source policy, so variant {config.variant!r} does not"
-            " apply (nearest: 'scratch')"
+            f"task {config.task} has no source policy of its own, so variant {config.variant!r}"
+            " needs one named with --source (nearest variant without: 'scratch')"
         )
     if config.variant == "scratch":
         with rundir.exclusive(run_dir):
@@ -104,15 +104,17 @@ def find_source(config: TrainConfig, preset: str, runs_dir: Path, say: Say) -> S
     """Return the source policy of a run, training it first when there is none.
 
     ``config.source`` is ``auto`` (the policy shipped in ``assets/policies``, else a run of the
-    source task, else train one), ``train``, the name of a scripted policy, or a path.
+    source task, else train one), ``train``, the name of a scripted policy, or a path. The source's
+    own run has the same preset and seed, and may need a source itself.
 
     Raises:
         StoppedError: Training the source was stopped.
         FileNotFoundError: A path that does not exist, or no finished nominal run under a shift.
     """
     wanted = config.source
-    if wanted in scripted.SCRIPTED:
-        return Source(scripted.get_scripted(wanted), f"scripted {wanted}", wanted)
+    if wanted in SCRIPTED_SOURCES:
+        found = resolve_policy(wanted, config)
+        return Source(found.policy, found.origin, wanted)
     if wanted not in ("auto", "train"):
         return _from_path(config, Path(wanted))
     if config.shift != "none":
@@ -130,9 +132,7 @@ def find_source(config: TrainConfig, preset: str, runs_dir: Path, say: Say) -> S
     source_config = dataclasses.replace(make_config(source_task, preset), seed=config.seed)
     source_dir = runs_dir / rundir.default_name(source_config, preset)
     say(f"stage 1 of 3: source policy, task {source_task}, in {source_dir}")
-    with rundir.exclusive(source_dir):
-        _train(source_config, source_dir, None, None)
-    return _from_path(config, source_dir)
+    return _from_path(config, run(source_config, preset, runs_dir, None, say))
 
 
 def _nominal_run(config: TrainConfig, preset: str, runs_dir: Path) -> Source:

@@ -1,0 +1,114 @@
+"""Learning curves with the fast and with the plain form of the learner, at equal updates.
+
+Both forms train the same seeds of one preset for the same transitions. They draw other random
+numbers (dropout bits above all), so the curves of one seed part after a while; what must agree is
+where the seeds of both forms lie.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+
+import jax
+import numpy as np
+
+from twirl_mjx.bench.measure import Record, machine, progress
+from twirl_mjx.config import TASKS, TrainConfig, check_choice, check_range
+from twirl_mjx.presets import PRESETS, make_config
+from twirl_mjx.tasks.registry import make_env
+from twirl_mjx.training import seeds
+
+FORMS = ("fast", "plain")
+QUARTERS = 4
+"""Parts of the run whose mean returns are compared."""
+
+
+@dataclasses.dataclass(frozen=True)
+class FormsBench:
+    """Train with both forms of the learner and compare the returns, minutes."""
+
+    json: bool = False
+    """Print one JSON document on stdout, and nothing else."""
+    task: str = "stand"
+    """Task, trained from scratch."""
+    preset: str = "cpu"
+    """Sizes: paper, cpu or debug."""
+    seeds: int = 3
+    """Seeds, one program."""
+    env_steps: int = 48_000
+    """Transitions of each seed, rounded down to whole epochs."""
+
+    def __post_init__(self) -> None:
+        """Check names and numbers.
+
+        Raises:
+            ValueError: Unknown name, or a value out of range.
+        """
+        check_choice("task", self.task, TASKS)
+        check_choice("preset", self.preset, PRESETS)
+        check_range("seeds", self.seeds, 2, 1000)
+        epoch = self.config("fast").steps_per_epoch * self.config("fast").env.num_envs
+        check_range("env_steps", self.env_steps, QUARTERS * epoch, 10**9)
+
+    def config(self, form: str) -> TrainConfig:
+        """Return the run with one form of the learner."""
+        base = make_config(self.task, self.preset)
+        droq = dataclasses.replace(base.droq, fast=form == "fast")
+        return dataclasses.replace(base, variant="scratch", droq=droq)
+
+
+def returns_of(options: FormsBench, form: str) -> tuple[np.ndarray, int, float]:
+    """Train all seeds with one form.
+
+    Returns:
+        Mean episode returns [epochs, seeds] (NaN where no episode ended), the critic updates of
+        each seed, and the seconds it took.
+    """
+    config = options.config(form)
+    env = make_env(config, training=True)
+    states = seeds.init_seeds(config, env, range(options.seeds), None)
+    epoch = seeds.compile_epoch_seeds(config, env)
+    epochs = options.env_steps // (config.steps_per_epoch * env.num_envs)
+    began, rows = time.perf_counter(), []
+    for number in range(epochs):
+        states, metrics = epoch(states)
+        rows.append(np.asarray(metrics["return"]))
+        progress(
+            f"bench forms: {form}, epoch {number + 1} of {epochs}, return {rows[-1].mean():.1f}"
+        )
+    updates = int(np.asarray(jax.device_get(states.learner.grad_steps))[0])
+    return np.stack(rows), updates, time.perf_counter() - began
+
+
+def overlap(a: np.ndarray, b: np.ndarray) -> bool:
+    """Return whether the ranges of two sets of numbers have a point in common."""
+    return bool(a.min() <= b.max() and b.min() <= a.max())
+
+
+def measure(options: FormsBench) -> Record:
+    """Train with both forms; compare every quarter of the run."""
+    record_machine = machine()
+    found = {form: returns_of(options, form) for form in FORMS}
+    quarters = []
+    for number in range(QUARTERS):
+        parts = {
+            form: np.nanmean(np.array_split(rows, QUARTERS)[number], axis=0)
+            for form, (rows, _, _) in found.items()
+        }
+        quarters.append(
+            {form: part.tolist() for form, part in parts.items()}
+            | {"overlap": overlap(parts["fast"], parts["plain"])}
+        )
+    return {
+        "part": "forms",
+        "task": options.task,
+        "preset": options.preset,
+        "seeds": options.seeds,
+        "env_steps": options.env_steps,
+        "critic_updates": found["fast"][1],
+        "quarters": quarters,
+        "wall_s": {form: wall for form, (_, _, wall) in found.items()},
+        "returns": {form: rows.tolist() for form, (rows, _, _) in found.items()},
+        "machine": record_machine,
+    }
