@@ -266,6 +266,13 @@ def test_early_termination(harness: Harness) -> None:
 
     assert outcome(kneel) == {"lost": False, "fall": True}
 
+    def squat(pose: np.ndarray) -> None:  # lower ends of the calves in the ground, knees above
+        thigh = 1.35
+        pose[2] = 0.2 * np.cos(thigh) + 0.2 * np.cos(2.6 - thigh) + 0.005
+        pose[7:] = np.tile([0.0, thigh, -2.6], 4)
+
+    assert outcome(squat) == {"lost": False, "fall": False}
+
     def crouch(pose: np.ndarray) -> None:  # feet in the ground, nothing else
         pose[2] = a1.HOME_HEIGHT - 0.01
 

@@ -123,6 +123,15 @@ def test_other_config_is_refused_with_a_diff(stand_config: TrainConfig, whole_ru
     assert (whole_run / "config.json").read_bytes() == before
 
 
+def test_options_of_tasks_the_run_does_not_read_may_change(stand_config: TrainConfig) -> None:
+    assert "hurdles." in rundir.may_change(stand_config)
+    assert "imitate." in rundir.may_change(stand_config)
+    assert "biped." not in rundir.may_change(stand_config)  # the goal that stand shows
+    assert "stand." not in rundir.may_change(stand_config)
+    biped = dataclasses.replace(stand_config, task="biped")
+    assert "stand." in rundir.may_change(biped)
+
+
 def test_stop_event_saves_and_ends_the_loop(
     stand_config: TrainConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -32,11 +32,12 @@ class ResolvedPolicy:
     """The numpy policy behind it, if any."""
 
 
-def resolve_policy(name: str, config: TrainConfig) -> ResolvedPolicy:
+def resolve_policy(name: str, config: TrainConfig, *, noise: bool = False) -> ResolvedPolicy:
     """Return a policy by scripted name or by path (policy file, ONNX file, run directory).
 
     A learned policy observes as the task it was trained on, with that task's options in
-    ``config``; an ONNX file sees the observations of the task it acts in.
+    ``config``, and acts deterministically unless ``noise`` is asked for; an ONNX file sees the
+    observations of the task it acts in.
 
     Raises:
         FileNotFoundError: Nothing to load there.
@@ -51,7 +52,7 @@ def resolve_policy(name: str, config: TrainConfig) -> ResolvedPolicy:
         return ResolvedPolicy(from_policy(loaded), name, task, loaded)
     actor = jax.tree.map(jnp.asarray, dict(loaded.actor_params))
     observer = make_task(dataclasses.replace(config, task=loaded.header.task)).observer
-    return ResolvedPolicy(LearnedSource(actor, observer), name, task, loaded)
+    return ResolvedPolicy(LearnedSource(actor, observer, noise=noise), name, task, loaded)
 
 
 def _scripted(name: str, config: TrainConfig) -> SourcePolicy:

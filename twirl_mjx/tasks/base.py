@@ -67,10 +67,16 @@ class View(flax.struct.PyTreeNode):
     """[18] at the end of the step."""
     qpos_trace: jax.Array
     """[S, 19] after every physics substep."""
-    clearance: jax.Array
-    """[G] m, lowest point of every contact shape over the local ground, at the end."""
+    end_clearance: jax.Array
+    """[G, 2] m, lowest points of both ends of every contact shape over the local ground, at the
+    end of the step."""
     height: jax.Array
     """m, base over the local ground."""
+
+    @property
+    def clearance(self) -> jax.Array:
+        """[G] m, lowest point of every contact shape over the local ground."""
+        return jnp.min(self.end_clearance, axis=-1)
 
 
 class Outcome(flax.struct.PyTreeNode):
@@ -121,9 +127,9 @@ def ground_at(scene: Scene, dynamics: Dynamics, xy: jax.Array) -> jax.Array:
 
 
 def clearances(scene: Scene, dynamics: Dynamics, endpoints: jax.Array) -> jax.Array:
-    """Return the lowest height over local ground [..., G] of shapes [..., G, 2, 3]."""
+    """Return the lowest heights [..., G, 2] in m of both ends of shapes [..., G, 2, 3]."""
     ground = ground_at(scene, dynamics, endpoints[..., :2])
-    return jnp.min(endpoints[..., 2] - ground, axis=-1) - jnp.asarray(a1.CONTACT_RADII, jnp.float32)
+    return endpoints[..., 2] - ground - jnp.asarray(a1.CONTACT_RADII, jnp.float32)[:, None]
 
 
 def make_view(scene: Scene, dynamics: Dynamics, qpos: jax.Array, qvel: jax.Array) -> View:
@@ -134,7 +140,7 @@ def make_view(scene: Scene, dynamics: Dynamics, qpos: jax.Array, qvel: jax.Array
         qpos=last,
         qvel=qvel[-1],
         qpos_trace=qpos,
-        clearance=clearances(scene, dynamics, endpoints),
+        end_clearance=clearances(scene, dynamics, endpoints),
         height=last[2] - ground_at(scene, dynamics, last[:2]),
     )
 
@@ -142,6 +148,11 @@ def make_view(scene: Scene, dynamics: Dynamics, qpos: jax.Array, qvel: jax.Array
 def touches(view: View, *bodies: str) -> jax.Array:
     """Return whether any shape of the named body classes touches the ground."""
     return jnp.any(view.clearance[np.flatnonzero(a1.contact_mask(*bodies))] <= 0.0)
+
+
+def knees_touch(view: View) -> jax.Array:
+    """Return whether the upper end of any calf touches the ground."""
+    return jnp.any(view.end_clearance[np.flatnonzero(a1.contact_mask(a1.CALF)), 0] <= 0.0)
 
 
 def foot_clearance(view: View) -> jax.Array:

@@ -151,7 +151,8 @@ def _nominal_run(config: TrainConfig, preset: str, runs_dir: Path) -> Source:
 
 
 def _from_path(config: TrainConfig, path: Path) -> Source:
-    found = resolve_policy(str(path), config)
+    noise = config.uses_source_data and config.replay.source_noise
+    found = resolve_policy(str(path), config, noise=noise)
     if path.is_dir():
         progress = found.loaded.header.card.get("env_steps")
         digest = f"{rundir.digest(rundir.read_config(path))}@{progress}"
@@ -200,6 +201,7 @@ def collection_digest(config: TrainConfig, source: Source) -> str:
         "env": dataclasses.asdict(config.env),
         "seed": config.seed,
         "size": config.replay.source_size,
+        "noise": config.replay.source_noise,
         "source": source.digest,
     }
     return hashlib.sha256(json.dumps(decides, sort_keys=True).encode()).hexdigest()[:12]

@@ -16,7 +16,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from twirl_mjx import config_json
-from twirl_mjx.config import TrainConfig
+from twirl_mjx.config import TASKS, TrainConfig
 
 CONFIG_NAME = "config.json"
 VERSIONS_NAME = "versions.json"
@@ -27,6 +27,8 @@ PACKAGES = (
 )  # fmt: skip
 MAY_CHANGE = ("total_env_steps", "checkpoint_minutes", "eval.", "env.engine", "source")
 """Fields a resumed run may have changed: they do not alter what was done so far."""
+READS_OPTIONS_OF = {"stand": ("stand", "biped")}
+"""Tasks whose options a task reads, where these are not its own alone (stand shows a goal)."""
 
 
 class RunMismatchError(ValueError):
@@ -89,6 +91,12 @@ def digest(config: TrainConfig) -> str:
     return hashlib.sha256(config_json.to_json(config).encode()).hexdigest()[:12]
 
 
+def may_change(config: TrainConfig) -> tuple[str, ...]:
+    """Return how the names of the fields begin that a resumed run may have changed."""
+    read = READS_OPTIONS_OF.get(config.task, (config.task,))
+    return (*MAY_CHANGE, *(f"{task}." for task in TASKS if task not in read))
+
+
 def open_run(run_dir: Path, config: TrainConfig) -> None:
     """Create a run directory, or check that an existing one belongs to this config.
 
@@ -98,9 +106,8 @@ def open_run(run_dir: Path, config: TrainConfig) -> None:
     path = run_dir / CONFIG_NAME
     if path.exists():
         old = config_json.from_json(path.read_text())
-        lines = [
-            line for line in config_json.diff(old, config) if not line.startswith(tuple(MAY_CHANGE))
-        ]
+        changed, free = config_json.diff(old, config), may_change(config)
+        lines = [line for line in changed if not line.startswith(free)]
         if lines:
             shown = "\n  ".join(lines)
             raise RunMismatchError(
