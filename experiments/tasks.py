@@ -30,12 +30,12 @@ GRID = (
 )
 
 SMALL = {
-    "total_env_steps": 38_400,
+    "total_env_steps": 19_200,
     "warmup_env_steps": 3200,
     "epoch_env_steps": 3200,
     "droq.utd": 1.0,
     "replay.source_size": 20_000,
-    "eval.every": 6400,
+    "eval.every": 3200,
     "eval.episodes": 16,
     "eval.final_episodes": 32,
 }
@@ -56,6 +56,6 @@ REDUCED = (
 )
 
 REDUCED_NOTE = (
-    "38k of 1M transitions (scratch on hurdles: of 3M), UTD 1 of 20, networks 2 x 128 of 2 x 256, "
+    "19k of 1M transitions (scratch on hurdles: of 3M), UTD 1 of 20, networks 2 x 128 of 2 x 256, "
     "2 of 3 seeds, 32 of 100 final episodes"
 )

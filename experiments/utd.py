@@ -23,11 +23,11 @@ REDUCED = (
         "seeds": (0, 1),
         "base": {
             "variant": "twirl",
-            "total_env_steps": 6400,
-            "warmup_env_steps": 800,
-            "epoch_env_steps": 800,
+            "total_env_steps": 3200,
+            "warmup_env_steps": 400,
+            "epoch_env_steps": 400,
             "env.num_envs": 16,
-            "eval.every": 1600,
+            "eval.every": 800,
             "eval.episodes": 16,
             "eval.final_episodes": 32,
         },
@@ -41,6 +41,6 @@ REDUCED = (
 )
 
 REDUCED_NOTE = (
-    "biped on ice only (of 2 tasks x 5 shifts), 6.4k of 100k transitions, networks 2 x 128 of "
+    "biped on ice only (of 2 tasks x 5 shifts), 3.2k of 100k transitions, networks 2 x 128 of "
     "2 x 256, 2 of 3 seeds that share one nominal run, 32 of 100 final episodes"
 )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from collections.abc import Callable
 
 import pytest
 
@@ -12,8 +13,11 @@ from twirl_mjx.config import (
     SCRIPTED_SOURCES,
     SOURCE_OF,
     TASKS,
+    BipedConfig,
     DroqConfig,
     EnvConfig,
+    HurdlesConfig,
+    ImitateConfig,
     ReplayConfig,
     TrainConfig,
 )
@@ -112,3 +116,22 @@ def test_diff_names_every_field_that_differs() -> None:
     b = dataclasses.replace(a, seed=3, droq=dataclasses.replace(a.droq, tau=0.01))
     assert config_json.diff(a, b) == ["seed: 0 -> 3", "droq.tau: 0.005 -> 0.01"]
     assert config_json.diff(a, a) == []
+
+
+@pytest.mark.parametrize(
+    ("build", "match"),
+    [
+        (
+            lambda: BipedConfig(goal_min_radius=6.0),
+            r"radius = 6.0 is outside \[0.0, 5.0\]",
+        ),
+        (lambda: BipedConfig(goal_mean_radius=-1.0), "goal_mean_radius = -1.0 is outside"),
+        (lambda: ImitateConfig(max_root_error=0.0), "max_root_error = 0.0 is outside"),
+        (lambda: ImitateConfig(standing_fraction=1.5), "standing_fraction = 1.5 is outside"),
+        (lambda: HurdlesConfig(hurdle_bonus="evnt"), "nearest: 'event'"),  # type: ignore[arg-type]
+        (lambda: TrainConfig(total_env_steps=2**31), "total_env_steps = 2147483648 is outside"),
+    ],
+)
+def test_task_options_are_checked(build: Callable[[], object], match: str) -> None:
+    with pytest.raises(ValueError, match=match):
+        build()

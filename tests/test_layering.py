@@ -14,20 +14,21 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = "twirl_mjx"
 
-BASE = {"types", "config", "presets", "config_json", "assets"}
+BASE = {"types", "checks", "config", "presets", "config_json", "assets"}
 WORLD = BASE | {"sim", "motion"}
 ACTING = WORLD | {"tasks", "droq", "policies"}
 ALLOWED: dict[str, set[str]] = {
     "types": set(),
+    "checks": set(),
     "assets": set(),
-    "config": {"types"},
-    "presets": {"config"},
-    "config_json": {"config", "presets"},
+    "config": {"types", "checks"},
+    "presets": {"checks", "config"},
+    "config_json": {"checks", "config", "presets"},
     "sim": BASE,
     "motion": WORLD,
     "tasks": WORLD,
-    "replay": {"types", "config"},
-    "droq": {"types", "config"},
+    "replay": {"types", "checks", "config"},
+    "droq": {"types", "checks", "config"},
     "policies": ACTING,
     "evaluation": ACTING,
     "training": ACTING | {"evaluation", "replay"},

@@ -10,6 +10,8 @@ import os
 import sys
 from pathlib import Path
 
+from twirl_mjx.deploy.gl import probe_gl
+
 COMMANDS = {
     "train": "train a task: source policy, its experience, TWiRL; resumes",
     "collect": "record a source policy in a target task as a dataset",
@@ -26,6 +28,8 @@ COMMANDS = {
     "curriculum": "train the chain of tasks one after another",
 }
 """Command name to its one-line description; each lives in ``twirl_mjx.commands.<name>``."""
+DRAWING = ("render", "demo", "clip")
+"""Commands that draw the robot."""
 
 
 def _usage() -> str:
@@ -37,7 +41,7 @@ def _usage() -> str:
     )
 
 
-def _set_environment() -> None:
+def _set_environment(command: str) -> None:
     """Choose the compilation cache and the GL backend before anything heavy is imported.
 
     ``TWIRL_CACHE_DIR`` places jax's persistent compilation cache (``~/.cache/twirl_mjx/jax`` by
@@ -47,7 +51,8 @@ def _set_environment() -> None:
     if cache != "off":
         os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", cache)
         os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.5")
-    os.environ.setdefault("MUJOCO_GL", "egl")
+    if "MUJOCO_GL" not in os.environ:
+        os.environ["MUJOCO_GL"] = probe_gl(os.environ) if command in DRAWING else "disable"
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # Ray would report to its makers
 
@@ -75,9 +80,9 @@ def main(argv: list[str] | None = None) -> int:
         print(f"twirl: unknown command {name!r} (nearest: {nearest!r})\n", file=sys.stderr)
         print(_usage(), end="", file=sys.stderr)
         return 2
-    _set_environment()
-    command = _import_command(name)
     try:
+        _set_environment(name)
+        command = _import_command(name)
         return command.main(rest)  # type: ignore[attr-defined]
     except (ValueError, FileNotFoundError) as error:
         print(f"twirl {name}: {error}", file=sys.stderr)

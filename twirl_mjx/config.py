@@ -6,8 +6,9 @@ Defaults are the paper's numbers; see ``presets.make_config`` and ``config_json`
 from __future__ import annotations
 
 import dataclasses
-import difflib
 from typing import Literal
+
+from twirl_mjx.checks import check_choice, check_range
 
 Variant = Literal["scratch", "twirl", "twirl+weights", "weights", "zero-shot"]
 VARIANTS: tuple[Variant, ...] = ("scratch", "twirl", "twirl+weights", "weights", "zero-shot")
@@ -17,30 +18,6 @@ SOURCE_OF = {"biped": "stand", "hurdles": "imitate"}
 """Task whose trained policy is the default source of another task."""
 SCRIPTED_SOURCES = ("trot", "bound", "zero", "random", "clip")
 """Sources nobody trained, by name; ``clip`` plays the actions planned for ``imitate.clip``."""
-
-
-def check_choice(what: str, value: str, choices: tuple[str, ...]) -> None:
-    """Refuse a value that is not one of ``choices``.
-
-    Raises:
-        ValueError: The message lists the choices and the nearest one.
-    """
-    if value not in choices:
-        nearest = (difflib.get_close_matches(value, choices, n=1, cutoff=0.0) or choices[:1])[0]
-        raise ValueError(
-            f"unknown {what} {value!r}: choose one of {', '.join(choices)} (nearest: {nearest!r})"
-        )
-
-
-def check_range(what: str, value: float, low: float, high: float) -> None:
-    """Refuse a number outside [low, high].
-
-    Raises:
-        ValueError: The message names the value, the range and the nearest end.
-    """
-    if not low <= value <= high:
-        nearest = low if not value > low else high
-        raise ValueError(f"{what} = {value} is outside [{low}, {high}] (nearest: {nearest})")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -151,6 +128,12 @@ class BipedConfig:
     fixed_goal: tuple[float, float] = (1.5, 0.0)
     """m, the goal when the course is fixed (dynamics shifts); on the hill in ``sloped``."""
 
+    def __post_init__(self) -> None:
+        """Check every number, or raise ValueError."""
+        check_range("biped.goal_mean_radius", self.goal_mean_radius, 0.0, 100.0)
+        check_range("biped.goal_max_radius", self.goal_max_radius, 0.0, 100.0)
+        check_range("biped.goal_min_radius", self.goal_min_radius, 0.0, self.goal_max_radius)
+
 
 @dataclasses.dataclass(frozen=True)
 class ImitateConfig:
@@ -166,8 +149,10 @@ class ImitateConfig:
     """rad, an episode ends beyond this rotation from the reference root."""
 
     def __post_init__(self) -> None:
-        """Check the share, or raise ValueError."""
+        """Check every number, or raise ValueError."""
         check_range("imitate.standing_fraction", self.standing_fraction, 0.0, 1.0)
+        check_range("imitate.max_root_error", self.max_root_error, 1e-3, 1e3)
+        check_range("imitate.max_root_angle", self.max_root_angle, 1e-3, 3.1416)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -182,6 +167,10 @@ class HurdlesConfig:
     """m, distance when the course is fixed (dynamics shifts)."""
     hurdle_bonus: Literal["count", "event"] = "count"
     """Pay the number of hurdles passed so far at every step, or 1 when one is passed."""
+
+    def __post_init__(self) -> None:
+        """Check the bonus (the task checks the gaps), or raise ValueError."""
+        check_choice("hurdles.hurdle_bonus", self.hurdle_bonus, ("count", "event"))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -288,7 +277,7 @@ class TrainConfig:
         check_choice("shift", self.shift, SHIFTS)
         check_choice("variant", self.variant, VARIANTS)
         check_range("shift_strength", self.shift_strength, 0.0, 2.0)
-        check_range("total_env_steps", self.total_env_steps, 1, 10**12)
+        check_range("total_env_steps", self.total_env_steps, 1, 2**31 - 1)  # counted in int32
         check_range("warmup_env_steps", self.warmup_env_steps, 0, 10**12)
         check_range("epoch_env_steps", self.epoch_env_steps, 1, 10**9)
         check_range("checkpoint_minutes", self.checkpoint_minutes, 0.0, 1e6)

@@ -6,7 +6,8 @@ import dataclasses
 import json
 from typing import Any
 
-from twirl_mjx.config import TrainConfig, check_choice
+from twirl_mjx.checks import check_choice
+from twirl_mjx.config import TrainConfig
 
 
 def to_json(config: TrainConfig) -> str:

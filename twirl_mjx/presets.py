@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 
+from twirl_mjx.checks import check_choice
 from twirl_mjx.config import (
     SOURCE_OF,
     TASKS,
@@ -14,7 +15,6 @@ from twirl_mjx.config import (
     ReplayConfig,
     StandConfig,
     TrainConfig,
-    check_choice,
 )
 
 PRESETS = ("paper", "cpu", "debug")
@@ -34,7 +34,7 @@ CPU_ENV_STEPS = {"stand": 1_200_000, "biped": 800_000, "imitate": 1_600_000, "hu
 """Transitions per task that fit two CPU cores in about an hour each."""
 
 
-CPU_DISCOUNT = {"stand": 0.97, "biped": 0.97, "imitate": 0.95, "hurdles": 0.99}
+CPU_DISCOUNT = {"stand": 0.97, "biped": 0.97, "imitate": 0.95, "hurdles": 0.97}
 """Discounts: 0.97 leaves the safe poor optimum of sitting, 0.95 is that of Peng et al. 2020."""
 
 
@@ -74,6 +74,29 @@ def _debug(task: str) -> TrainConfig:
         eval=EvalConfig(every=64, episodes=2, final_episodes=4),
         checkpoint_minutes=0.0,
     )
+
+
+def source_task_of(config: TrainConfig) -> str:
+    """Return the task whose policy is the source of a run that names none.
+
+    Raises:
+        ValueError: The task has no such source.
+    """
+    if config.task not in SOURCE_OF:
+        raise ValueError(
+            f"task {config.task} has no source policy of its own, so variant {config.variant!r}"
+            " needs one named with --source (nearest variant without: 'scratch')"
+        )
+    return SOURCE_OF[config.task]
+
+
+def starts_from_nominal_run(config: TrainConfig, preset: str) -> bool:
+    """Return whether a run adapts a finished run of its own task to a shift.
+
+    It does unless it names another source than the preset would without the shift.
+    """
+    plain = make_config(config.task, preset).source
+    return config.shift != "none" and config.source in ("auto", "train", plain)
 
 
 def make_config(task: str, preset: str = "paper") -> TrainConfig:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from twirl_mjx.deploy import gl as gl_probe
 from twirl_mjx.deploy import render
 from twirl_mjx.deploy.rehearsal import IDEAL
 from twirl_mjx.deploy.render import CameraView, RenderError, look_at_path, render_frames
@@ -106,16 +107,17 @@ def test_bad_trajectories_are_refused(model: mujoco.MjModel) -> None:
 
 
 def test_message_names_what_was_tried_and_the_fix(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(render, "GL_BACKENDS", ("nosuch", "neither"))
+    for module in (render, gl_probe):
+        monkeypatch.setattr(module, "GL_BACKENDS", ("nosuch", "neither"))
     with pytest.raises(RenderError, match=r"Tried nosuch: .*; neither: .*Fix: .*libegl1"):
         render.open_context(8, 8)
     with pytest.raises(RenderError, match=r"nosuch: RuntimeError: invalid value .*neither: "):
-        render.probe_gl(os.environ)
+        gl_probe.probe_gl(os.environ)
 
 
 @pytest.mark.usefixtures("gl")
 def test_probe_finds_a_backend() -> None:
-    assert render.probe_gl({**os.environ, "MUJOCO_GL": "nonsense"}) in render.GL_BACKENDS
+    assert gl_probe.probe_gl({**os.environ, "MUJOCO_GL": "nonsense"}) in gl_probe.GL_BACKENDS
 
 
 def test_camera_follows_smoothly_without_lag() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import dataclasses
 from pathlib import Path
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -143,3 +144,82 @@ def test_directory_of_another_config_is_refused(biped: TrainConfig, runs: Path) 
     other = dataclasses.replace(biped, source="trot", warmup_env_steps=0)
     with pytest.raises(rundir.RunMismatchError, match="warmup_env_steps: 32 -> 0"):
         pipeline.run(other, "debug", runs, None, print)
+
+
+def test_another_source_is_refused_in_a_run_that_has_one(biped: TrainConfig, runs: Path) -> None:
+    run_dir = runs / "biped-twirl-debug-s0"
+    before = {name: (run_dir / name).read_bytes() for name in ("config.json", "source.npz")}
+    other = dataclasses.replace(biped, source="bound")
+    with pytest.raises(rundir.RunMismatchError, match="source digest: 'trot' -> 'bound'"):
+        pipeline.run(other, "debug", runs, None, print)
+    assert before == {name: (run_dir / name).read_bytes() for name in before}
+
+
+def test_the_engine_does_not_decide_what_is_collected(biped: TrainConfig, runs: Path) -> None:
+    config = dataclasses.replace(biped, source="trot")
+    source = pipeline.find_source(config, "debug", runs, print)
+    digest = pipeline.collection_digest(config, source)
+    mjx = dataclasses.replace(config, env=dataclasses.replace(config.env, engine="mjx"))
+    assert pipeline.collection_digest(mjx, source) == digest
+    quiet = dataclasses.replace(config.replay, source_noise=False)
+    calm = dataclasses.replace(config, replay=quiet)
+    assert pipeline.collection_digest(calm, source) != digest
+
+
+def test_a_learned_source_is_noisy_only_while_its_data_are_collected(
+    biped: TrainConfig, runs: Path
+) -> None:
+    path = str(runs / "biped-twirl-debug-s0" / "policy.npz")
+    state = SimpleNamespace(obs=jnp.zeros((3, 101)))
+
+    def actions(config: TrainConfig) -> np.ndarray:
+        found = pipeline.find_source(dataclasses.replace(config, source=path), "debug", runs, print)
+        return np.asarray(found.policy.act((), state, jax.random.key(0))[0])
+
+    mean = load_policy(path).act(np.zeros((3, 101)))
+    np.testing.assert_allclose(
+        actions(dataclasses.replace(biped, variant="zero-shot")), mean, atol=1e-6
+    )
+    calm = dataclasses.replace(biped.replay, source_noise=False)
+    np.testing.assert_allclose(actions(dataclasses.replace(biped, replay=calm)), mean, atol=1e-6)
+    noisy = actions(biped)
+    assert np.abs(noisy - mean).max() > 0.05
+    assert np.abs(noisy[0] - noisy[1]).max() > 0.05
+
+
+def test_the_replay_of_another_task_is_no_source_data(biped: TrainConfig, tmp_path: Path) -> None:
+    stand = SimpleNamespace(header=SimpleNamespace(task="stand"))
+    source = pipeline.Source(None, "a stand run", "digest", stand, tmp_path)  # type: ignore[arg-type]
+    config = dataclasses.replace(biped, shift="icy")
+    with pytest.raises(ValueError, match="is a run of task stand: its replay is no experience"):
+        pipeline.source_data(config, tmp_path, source, print)
+
+
+def test_weights_that_cannot_fit_are_refused_before_any_stage(
+    biped: TrainConfig, runs: Path, tmp_path: Path
+) -> None:
+    hurdles = dataclasses.replace(make_config("hurdles", "debug"), variant="twirl+weights")
+    with pytest.raises(ValueError, match="source task imitate observes as task imitate"):
+        pipeline.run(hurdles, "debug", tmp_path, None, print)
+    assert list(tmp_path.iterdir()) == []
+    wide = dataclasses.replace(
+        biped,
+        variant="weights",
+        source=str(runs / "biped-twirl-debug-s0"),
+        droq=dataclasses.replace(biped.droq, hidden_sizes=(64, 32)),
+    )
+    with pytest.raises(ValueError, match=r"hidden layers of \(32, 32\) units.*hidden-sizes 32 32"):
+        pipeline.run(wide, "debug", tmp_path, None, print)
+
+
+def test_tasks_without_a_source_of_their_own(tmp_path: Path) -> None:
+    stand = dataclasses.replace(make_config("stand", "debug"), variant="twirl")
+    with pytest.raises(ValueError, match="task stand has no source policy of its own"):
+        pipeline.find_source(stand, "debug", tmp_path, print)
+    icy = dataclasses.replace(make_config("stand", "debug"), shift="icy", variant="weights")
+    with pytest.raises(FileNotFoundError, match="stand-scratch-debug-s0"):
+        pipeline.find_source(icy, "debug", tmp_path, print)
+    # The clip is the preset's source of imitate without a shift only.
+    imitate = dataclasses.replace(make_config("imitate", "cpu"), shift="icy")
+    with pytest.raises(FileNotFoundError, match="imitate-twirl-cpu-s0"):
+        pipeline.find_source(imitate, "cpu", tmp_path, print)

@@ -18,7 +18,8 @@ import jax
 import jax.numpy as jnp
 
 from twirl_mjx.bench.measure import Chain, Record, machine, progress, sample_rates, summary
-from twirl_mjx.config import TASKS, DroqConfig, TrainConfig, check_choice, check_range
+from twirl_mjx.checks import check_choice, check_range
+from twirl_mjx.config import TASKS, DroqConfig, TrainConfig
 from twirl_mjx.droq import learner as droq
 from twirl_mjx.presets import PRESETS, make_config
 from twirl_mjx.replay import mixed, ring

@@ -14,7 +14,8 @@ import jax
 import numpy as np
 
 from twirl_mjx.bench.measure import Record, machine, progress
-from twirl_mjx.config import TASKS, TrainConfig, check_choice, check_range
+from twirl_mjx.checks import check_choice, check_range
+from twirl_mjx.config import TASKS, TrainConfig
 from twirl_mjx.presets import PRESETS, make_config
 from twirl_mjx.tasks.registry import make_env
 from twirl_mjx.training import seeds

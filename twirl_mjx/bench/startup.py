@@ -18,7 +18,8 @@ import time
 from pathlib import Path
 
 from twirl_mjx.bench.measure import Record, machine, progress
-from twirl_mjx.config import TASKS, check_choice, check_range
+from twirl_mjx.checks import check_choice, check_range
+from twirl_mjx.config import TASKS
 from twirl_mjx.presets import PRESETS, make_config
 
 POLL_S = 0.05

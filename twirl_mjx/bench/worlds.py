@@ -29,7 +29,8 @@ from twirl_mjx.bench.measure import (
     sample_rates,
     summary,
 )
-from twirl_mjx.config import TASKS, check_choice, check_range
+from twirl_mjx.checks import check_choice, check_range
+from twirl_mjx.config import TASKS
 from twirl_mjx.sim.engine import resolve_engine
 from twirl_mjx.tasks.registry import make
 from twirl_mjx.tasks.vector import EnvState, VectorEnv

@@ -12,8 +12,8 @@ import time
 from pathlib import Path
 from typing import Any
 
+from twirl_mjx.checks import check_choice, check_range
 from twirl_mjx.commands.options import json_text, parse, say
-from twirl_mjx.config import check_choice, check_range
 
 PARTS = ("learner", "startup", "epoch", "worlds")
 """Worlds last: they leave out rows when the time is up."""

@@ -10,8 +10,8 @@ import numpy as np
 import tyro
 
 from twirl_mjx.assets import asset_path
+from twirl_mjx.checks import check_choice
 from twirl_mjx.commands.options import parse, say
-from twirl_mjx.config import check_choice
 from twirl_mjx.deploy.render import render_episode
 from twirl_mjx.motion import show as show_lib
 from twirl_mjx.motion.clip import configurations

@@ -11,7 +11,9 @@ def main(argv: list[str]) -> int:
     options = parse_train(argv, "twirl collect")
     config = options.config
     source = pipeline.find_source(config, options.preset, options.runs, say)
-    name = options.name or rundir.default_name(config, options.preset)
-    pipeline.source_data(config, options.runs / name, source, say)
-    say(f"done: {options.runs / name / 'source.npz'}")
+    run_dir = options.runs / (options.name or rundir.default_name(config, options.preset))
+    with rundir.exclusive(run_dir):
+        rundir.open_run(run_dir, config, source.identity)
+        pipeline.source_data(config, run_dir, source, say)
+    say(f"done: {run_dir / 'source.npz'}")
     return 0

@@ -8,8 +8,9 @@ from typing import Annotated, Literal
 
 import tyro
 
+from twirl_mjx.checks import check_choice
 from twirl_mjx.commands.options import default_preset, parse, say
-from twirl_mjx.config import SHIFTS, SOURCE_OF, check_choice
+from twirl_mjx.config import SHIFTS, SOURCE_OF
 from twirl_mjx.presets import PRESETS, make_config
 from twirl_mjx.training import pipeline, rundir
 from twirl_mjx.training.loop import EVAL_CSV

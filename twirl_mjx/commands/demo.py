@@ -9,9 +9,10 @@ from pathlib import Path
 import numpy as np
 
 from twirl_mjx.assets import asset_path
+from twirl_mjx.checks import check_range
 from twirl_mjx.commands.options import parse, say
 from twirl_mjx.commands.render import RenderOptions, film
-from twirl_mjx.config import TASKS, check_range
+from twirl_mjx.config import TASKS
 from twirl_mjx.evaluation.rollout import make_evaluate
 from twirl_mjx.policies.resolve import resolve_policy
 from twirl_mjx.presets import make_config

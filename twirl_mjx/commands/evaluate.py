@@ -14,9 +14,10 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
+from twirl_mjx.checks import check_choice, check_range
 from twirl_mjx.commands.options import parse, say
 from twirl_mjx.commands.render import config_of
-from twirl_mjx.config import SHIFTS, check_choice, check_range
+from twirl_mjx.config import SHIFTS
 from twirl_mjx.evaluation.shifts import evaluate_shifts
 from twirl_mjx.figures.statistics import bootstrap
 from twirl_mjx.policies.resolve import resolve_policy

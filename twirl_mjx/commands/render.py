@@ -9,8 +9,9 @@ from typing import Annotated
 import numpy as np
 import tyro
 
+from twirl_mjx.checks import check_choice
 from twirl_mjx.commands.options import parse, say
-from twirl_mjx.config import SHIFTS, TrainConfig, check_choice
+from twirl_mjx.config import SHIFTS, TrainConfig
 from twirl_mjx.deploy.render import render_episode
 from twirl_mjx.evaluation.record import Recording, record_episode, scene_model
 from twirl_mjx.policies.resolve import resolve_policy

@@ -1,8 +1,7 @@
 """Headless pictures of episodes: H.264 video and strips of PNG frames.
 
 Frames are drawn by MuJoCo's own renderer through EGL (graphics card or Mesa), or OSMesa where
-EGL does not exist. PyOpenGL fixes its platform once per process, so a program chooses before it
-imports MuJoCo: ``probe_gl`` says what works, and the command line sets ``MUJOCO_GL`` from it.
+EGL does not exist; see ``deploy.gl``.
 """
 
 from __future__ import annotations
@@ -10,19 +9,15 @@ from __future__ import annotations
 import copy
 import dataclasses
 import importlib
-import subprocess
-import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import mujoco
 import numpy as np
 
+from twirl_mjx.deploy.gl import GL_BACKENDS, RenderError, no_backend
 from twirl_mjx.deploy.video import overlay_text, strip_indices, write_strip, write_video
-
-GL_BACKENDS = ("egl", "osmesa")
-"""Headless OpenGL backends in the order they are tried."""
 
 SHADOW_HALF_SIZE = 1.6
 """m, half the edge of the square around the robot in which shadows are drawn."""
@@ -30,14 +25,6 @@ LIGHT_DISTANCE = 4.0
 """m, from the light to the robot."""
 
 GOAL_RGBA = (0.10, 0.65, 0.25, 0.9)
-_FIX = (
-    "on Debian and Ubuntu: `apt-get install libegl1 libgl1-mesa-dri` (EGL) or "
-    "`apt-get install libosmesa6` (OSMesa)"
-)
-
-
-class RenderError(RuntimeError):
-    """No way to draw on this machine; the message names what was tried and the fix."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -56,41 +43,6 @@ class CameraView:
     """Time constant with which the look-at point follows the base, s."""
 
 
-def probe_gl(environ: Mapping[str, str]) -> str:
-    """Return the first headless backend that works, tried in processes of their own.
-
-    Args:
-        environ: environment of the caller; ``MUJOCO_GL`` in it is replaced for the trials.
-
-    Returns:
-        The value for ``MUJOCO_GL``.
-
-    Raises:
-        RenderError: none works.
-    """
-    code = "import mujoco; mujoco.GLContext(64, 64).make_current()"
-    failures = []
-    for backend in GL_BACKENDS:
-        base = {k: v for k, v in environ.items() if k != "PYOPENGL_PLATFORM"}
-        trial = subprocess.run(
-            [sys.executable, "-c", code],
-            env={**base, "MUJOCO_GL": backend},
-            capture_output=True,
-            text=True,
-            timeout=120,
-            check=False,
-        )
-        if trial.returncode == 0:
-            return backend
-        lines = trial.stderr.strip().splitlines() or [f"exit code {trial.returncode}"]
-        failures.append(f"{backend}: {lines[-1]}")
-    raise RenderError(_no_backend(failures))
-
-
-def _no_backend(failures: Sequence[str]) -> str:
-    return f"cannot draw without a display. Tried {'; '.join(failures)}. Fix: {_FIX}"
-
-
 def open_context(width: int, height: int) -> Any:
     """Return a current OpenGL context from the first backend that works in this process.
 
@@ -106,7 +58,7 @@ def open_context(width: int, height: int) -> Any:
             failures.append(f"{backend}: {type(error).__name__}: {error}")
         else:
             return context
-    raise RenderError(_no_backend(failures))
+    raise RenderError(no_backend(failures))
 
 
 class SceneRenderer:

@@ -70,6 +70,14 @@ class HostPolicy:
         )
         return jax.pure_callback(self._on_host, shapes, obs, memory, vmap_method="broadcast_all")
 
+    def on_observation(self, obs: jax.Array, key: jax.Array) -> jax.Array:
+        """Return actions [..., A] at observations [..., O]; for a function without memory."""
+        del key  # host functions are deterministic
+        shape = jax.ShapeDtypeStruct((*obs.shape[:-1], self.action_size), jnp.float32)
+        return jax.pure_callback(
+            lambda rows: self._on_host(rows, None)[0], shape, obs, vmap_method="broadcast_all"
+        )
+
     def _on_host(self, obs: Any, memory: Any) -> tuple[np.ndarray, Any]:
         """Flatten leading axes, call the function, check and restore the shape."""
         obs = np.asarray(obs)

@@ -13,9 +13,11 @@ from twirl_mjx.config import SCRIPTED_SOURCES, TrainConfig
 from twirl_mjx.policies import scripted
 from twirl_mjx.policies.clip import ClipPolicy
 from twirl_mjx.policies.function import from_policy
-from twirl_mjx.policies.learned import NumpyPolicy, load_policy
-from twirl_mjx.policies.source import LearnedSource
+from twirl_mjx.policies.learned import NumpyPolicy, PolicyHeader, load_policy
+from twirl_mjx.policies.onnx_file import OnnxPolicy
+from twirl_mjx.policies.source import ActOnObs, ObservingSource, OwnTaskSource, actor_act
 from twirl_mjx.tasks.imitate import load_clip
+from twirl_mjx.tasks.observations import layout_size
 from twirl_mjx.tasks.registry import make_task
 from twirl_mjx.types import SourcePolicy
 
@@ -35,24 +37,49 @@ class ResolvedPolicy:
 def resolve_policy(name: str, config: TrainConfig, *, noise: bool = False) -> ResolvedPolicy:
     """Return a policy by scripted name or by path (policy file, ONNX file, run directory).
 
-    A learned policy observes as the task it was trained on, with that task's options in
-    ``config``, and acts deterministically unless ``noise`` is asked for; an ONNX file sees the
-    observations of the task it acts in.
+    A policy that says its task sees the worlds as that task shows them, with the options (the
+    clip, say) it was trained with; an ONNX file of other origin sees the observations of the task
+    it acts in. Learned policies act deterministically unless ``noise`` is asked for.
 
     Raises:
         FileNotFoundError: Nothing to load there.
         PolicyFileError: The file is no policy.
+        ValueError: The policy takes observations of another size than its task shows.
     """
     if name in SCRIPTED_SOURCES:
         return ResolvedPolicy(_scripted(name, config), f"scripted {name}", None)
     loaded = load_policy(Path(name))
-    header = getattr(loaded, "header", None)
-    task = header.task if header is not None else None
-    if not isinstance(loaded, NumpyPolicy):
-        return ResolvedPolicy(from_policy(loaded), name, task, loaded)
-    actor = jax.tree.map(jnp.asarray, dict(loaded.actor_params))
-    observer = make_task(dataclasses.replace(config, task=loaded.header.task)).observer
-    return ResolvedPolicy(LearnedSource(actor, observer, noise=noise), name, task, loaded)
+    task = config.task if loaded.header is None else loaded.header.task
+    own = config_of_source(config, loaded.header)
+    observer = make_task(own).observer
+    size = layout_size(observer.layout)
+    if size != loaded.observation_size:
+        raise ValueError(
+            f"{name} takes observations of {loaded.observation_size} numbers, task {task} shows"
+            f" {size}: its policies need another file"
+        )
+    act = _act_of(loaded, noise)
+    foreign = own.task != config.task
+    policy = ObservingSource(act, observer) if foreign else OwnTaskSource(act)
+    return ResolvedPolicy(policy, name, None if loaded.header is None else task, loaded)
+
+
+def config_of_source(config: TrainConfig, header: PolicyHeader | None) -> TrainConfig:
+    """Return the config under which a policy observes: its own task and that task's options."""
+    if header is None or header.task == config.task:
+        return config
+    options = {  # JSON has no tuples
+        name: tuple(value) if isinstance(value, list) else value
+        for name, value in header.card.get("options", {}).items()
+    }
+    own = dataclasses.replace(getattr(config, header.task), **options)
+    return dataclasses.replace(config, task=header.task, **{header.task: own})
+
+
+def _act_of(loaded: NumpyPolicy | OnnxPolicy, noise: bool) -> ActOnObs:
+    if isinstance(loaded, NumpyPolicy):
+        return actor_act(jax.tree.map(jnp.asarray, dict(loaded.actor_params)), noise=noise)
+    return from_policy(loaded).on_observation
 
 
 def _scripted(name: str, config: TrainConfig) -> SourcePolicy:

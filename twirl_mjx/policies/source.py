@@ -1,7 +1,8 @@
-"""A learned policy as a source: it brings its own observer into any task."""
+"""A policy with an observation of its own as a source: it brings its observer into any task."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import flax.struct
@@ -11,32 +12,50 @@ import jax.numpy as jnp
 from twirl_mjx.droq import learner as droq
 from twirl_mjx.tasks.observations import Observer
 
+ActOnObs = Callable[[jax.Array, jax.Array], jax.Array]
+"""(observations [N, O], key) -> actions [N, 12]; traceable by jax."""
 
-class LearnedMemory(flax.struct.PyTreeNode):
-    """Memory of a learned source policy in a foreign task."""
+
+class ObservedMemory(flax.struct.PyTreeNode):
+    """Memory of a source policy in a foreign task."""
 
     observer: Any
     """Memory of the source task's observer, leaves [N, ...]."""
 
 
-class LearnedSource:
-    """A trained actor that brings the observer of the task it was trained on.
+class OwnTaskSource:
+    """A policy in the task it was trained on: it sees that task's observation."""
 
-    Nothing of the target task reaches it but the physical state, its own last action and the
-    goal; with ``noise`` it acts as in training, else deterministically.
+    def __init__(self, act: ActOnObs) -> None:
+        """Keep what maps observations to actions."""
+        self._act = act
+
+    def init(self, state: Any) -> tuple[()]:
+        """Return no memory: the worlds keep the observer's."""
+        del state
+        return ()
+
+    def act(self, memory: tuple[()], state: Any, key: jax.Array) -> tuple[jax.Array, tuple[()]]:
+        """Act on the observation of the worlds."""
+        return self._act(state.obs, key), memory
+
+
+class ObservingSource:
+    """A policy in a foreign task, with the observer of the task it was trained on.
+
+    Nothing of the target task reaches it but the physical state, its own last action and the goal.
     """
 
-    def __init__(self, actor: Any, observer: Observer, *, noise: bool = False) -> None:
-        """Keep actor parameters (see ``droq.networks``) and the source task's observer."""
-        self._actor = actor
+    def __init__(self, act: ActOnObs, observer: Observer) -> None:
+        """Keep what maps observations to actions, and the source task's observer."""
+        self._act = act
         self._observer = observer
-        self._noise = noise
 
-    def init(self, state: Any) -> LearnedMemory:
+    def init(self, state: Any) -> ObservedMemory:
         """Start the observer in every world."""
-        return LearnedMemory(jax.vmap(self._observer.init)(state.data.qpos, state.data.qvel))
+        return ObservedMemory(jax.vmap(self._observer.init)(state.data.qpos, state.data.qvel))
 
-    def act(self, memory: LearnedMemory, state: Any, key: jax.Array) -> tuple[jax.Array, Any]:
+    def act(self, memory: ObservedMemory, state: Any, key: jax.Array) -> tuple[jax.Array, Any]:
         """Observe as the source task does, then act."""
         qpos, qvel, world = state.data.qpos, state.data.qvel, state.world
         fresh = self.init(state).observer
@@ -48,6 +67,13 @@ class LearnedSource:
 
         observer = jax.tree.map(pick, fresh, pushed)
         obs = jax.vmap(self._observer.observe)(observer, world.goal, qpos, qvel)
-        if self._noise:
-            return droq.sample_action(self._actor, obs, key), LearnedMemory(observer)
-        return droq.mean_action(self._actor, obs), LearnedMemory(observer)
+        return self._act(obs, key), ObservedMemory(observer)
+
+
+def actor_act(actor: Any, *, noise: bool = False) -> ActOnObs:
+    """Return how a trained actor acts: its mean, or with ``noise`` as in training."""
+
+    def act(obs: jax.Array, key: jax.Array) -> jax.Array:
+        return droq.sample_action(actor, obs, key) if noise else droq.mean_action(actor, obs)
+
+    return act

@@ -18,7 +18,8 @@ from types import ModuleType
 from typing import Any
 
 from twirl_mjx import config_json
-from twirl_mjx.config import TrainConfig, check_choice
+from twirl_mjx.checks import check_choice
+from twirl_mjx.config import TrainConfig
 from twirl_mjx.presets import PRESETS, make_config
 
 BLOCK_KEYS = ("preset", "seeds", "axes", "base", "nominal")

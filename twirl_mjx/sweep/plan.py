@@ -17,8 +17,8 @@ from typing import Literal
 
 from twirl_mjx import config_json
 from twirl_mjx.assets import asset_path
-from twirl_mjx.config import SCRIPTED_SOURCES, SOURCE_OF, TrainConfig
-from twirl_mjx.presets import make_config
+from twirl_mjx.config import SCRIPTED_SOURCES, TrainConfig
+from twirl_mjx.presets import make_config, source_task_of, starts_from_nominal_run
 from twirl_mjx.sweep.grid import Draft, Grid, configure
 from twirl_mjx.training import rundir
 
@@ -116,17 +116,18 @@ def _source_of(
     config = draft.config
     if config.variant == "scratch":
         return "auto", "auto", ()
-    if config.source in SCRIPTED_SOURCES:
+    adapts = starts_from_nominal_run(config, draft.preset)
+    if config.source in SCRIPTED_SOURCES and not adapts:
         return config.source, config.source, ()
-    if config.source not in ("auto", "train"):
+    if config.source not in ("auto", "train", *SCRIPTED_SOURCES):
         path = Path(config.source)
         return _identity_of_path(path), str(path.resolve()), ()
-    if config.shift != "none":
+    if adapts:
         if config.task in given:
             path = given[config.task]
             return _identity_of_path(path), str(path.resolve()), ()
         return _needed(_nominal_draft(draft), runs, given, cells)
-    task = SOURCE_OF[config.task]
+    task = source_task_of(config)
     shipped = _shipped(task)
     if config.source == "auto" and draft.preset != "debug" and shipped is not None:
         return _identity_of_path(shipped), "auto", ()
@@ -144,7 +145,8 @@ def _needed(
 def _nominal_draft(draft: Draft) -> Draft:
     """Return the run without a shift that an adaptation starts from: same task, preset, seed."""
     task, seed = draft.config.task, draft.config.seed
-    settings = {"task": task, "seed": seed, "variant": "twirl"} | dict(draft.nominal)
+    variant = make_config(task, draft.preset).variant
+    settings = {"task": task, "seed": seed, "variant": variant} | dict(draft.nominal)
     config = configure(draft.preset, settings, f"nominal run of arm {draft.arm}")
     return Draft("", draft.preset, config, ())
 
@@ -157,11 +159,8 @@ def _adoptable(draft: Draft, runs: Path) -> str | None:
     if draft.config != same or not (run_dir / EVAL_CSV).is_file():
         return None
     found = rundir.read_config(run_dir)
-    differs = [
-        line
-        for line in config_json.diff(found, same)
-        if not line.startswith(("checkpoint_minutes", "eval.", "env.engine", "source"))
-    ]
+    free = tuple(set(rundir.may_change(same)) - {"total_env_steps", "source"})
+    differs = [line for line in config_json.diff(found, same) if not line.startswith(free)]
     return None if differs else run_dir.name
 
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 
+from twirl_mjx.checks import check_choice
 from twirl_mjx.config import TASKS as TASK_NAMES
-from twirl_mjx.config import TrainConfig, check_choice
+from twirl_mjx.config import TrainConfig
 from twirl_mjx.sim.dynamics import SceneKind, get_shift, make_dynamics
 from twirl_mjx.sim.engine import make_engine
 from twirl_mjx.sim.scene import SimOptions, build_scene

@@ -118,7 +118,8 @@ def check_finite(learner: DroqState) -> None:
             name = jax.tree_util.keystr(path, simple=True, separator=".")
             raise DivergedError(
                 f"the learner diverged: {name} is not finite. The last good checkpoint is kept;"
-                " resume it with a smaller droq.learning_rate under another --name"
+                " start from its policy with a smaller droq.learning_rate: another --name,"
+                " --variant weights and --source this run"
             )
 
 
@@ -140,6 +141,7 @@ class Run:
         self.checkpoints = Checkpoints(run_dir)
         self.stage = stage
         self.source = source
+        self.source_rows = 0.0 if source is None else float(source.size)
         self.progress: dict[str, Any] = {"best": -math.inf, "wall_s": 0.0, "inserted": 0}
         env = make_env(config, num_envs=config.eval.episodes)
         self._evaluate = make_evaluate(env, no_memory, act_mean)
@@ -183,6 +185,9 @@ class Run:
             "shift": self.config.shift,
             "env_steps": int(train_state.env_steps),
             "grad_steps": int(train_state.learner.grad_steps),
+            "replay_ratio": self.config.droq.replay_ratio,
+            "wall_s": round(self.progress["wall_s"], 1),
+            "options": dataclasses.asdict(getattr(self.config, self.config.task)),
             "evaluation": means,
         }
         actor = jax.tree.map(np.asarray, train_state.learner.actor)
@@ -213,6 +218,7 @@ class Run:
             else:
                 train_state, metrics = self._epoch(train_state)
             values = {name: float(value) for name, value in metrics.items()}
+            values |= {"replay_ratio": config.droq.replay_ratio, "source_rows": self.source_rows}
             check_finite(train_state.learner)
             self.progress["wall_s"] = before + time.monotonic() - began
             now = int(train_state.env_steps)

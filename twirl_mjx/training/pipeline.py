@@ -19,12 +19,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from twirl_mjx.assets import asset_path
-from twirl_mjx.config import SCRIPTED_SOURCES, SOURCE_OF, TrainConfig
+from twirl_mjx.config import SCRIPTED_SOURCES, TrainConfig
 from twirl_mjx.droq.state import DroqState
-from twirl_mjx.policies.learned import NumpyPolicy
+from twirl_mjx.policies.learned import NumpyPolicy, hidden_layers
 from twirl_mjx.policies.resolve import resolve_policy
-from twirl_mjx.presets import PRESETS, make_config
+from twirl_mjx.presets import PRESETS, make_config, source_task_of, starts_from_nominal_run
 from twirl_mjx.replay import dataset, ring
+from twirl_mjx.tasks.imitate import load_clip
 from twirl_mjx.tasks.registry import make_env, make_task
 from twirl_mjx.training import loop, rundir
 from twirl_mjx.training.checkpoint import load_learner, load_replay
@@ -43,6 +44,11 @@ class Source:
     digest: str
     numpy_policy: Any = None
     run_dir: Path | None = None
+
+    @property
+    def identity(self) -> dict[str, str]:
+        """What a run directory remembers of its source."""
+        return {"origin": self.origin, "digest": self.digest}
 
 
 class StoppedError(RuntimeError):
@@ -68,23 +74,19 @@ def run(config: TrainConfig, preset: str, runs_dir: Path, name: str | None, say:
         RunBusyError: Another process works in the run directory.
     """
     run_dir = runs_dir / (name or rundir.default_name(config, preset))
-    needs_source = config.variant != "scratch" and config.shift == "none"
-    if needs_source and config.task not in SOURCE_OF and config.source in ("auto", "train"):
-        raise ValueError(
-            f"task {config.task} has no source policy of its own, so variant {config.variant!r}"
-            " needs one named with --source (nearest variant without: 'scratch')"
-        )
     if config.variant == "scratch":
         with rundir.exclusive(run_dir):
             return _train(config, run_dir, None, None)
+    check_weights_fit(config, preset)
     source = find_source(config, preset, runs_dir, say)
     with rundir.exclusive(run_dir):
+        rundir.open_run(run_dir, config, source.identity)
         if config.variant == "zero-shot":
             return zero_shot(config, run_dir, source, say)
-        data = source_data(config, run_dir, source, say) if config.uses_source_data else None
         initial = None
         if config.variant in ("weights", "twirl+weights"):
             initial = source_weights(config, source, say)
+        data = source_data(config, run_dir, source, say) if config.uses_source_data else None
         return _train(config, run_dir, data, initial)
 
 
@@ -112,16 +114,19 @@ def find_source(config: TrainConfig, preset: str, runs_dir: Path, say: Say) -> S
         FileNotFoundError: A path that does not exist, or no finished nominal run under a shift.
     """
     wanted = config.source
+    if starts_from_nominal_run(config, preset):
+        return _nominal_run(config, preset, runs_dir)
     if wanted in SCRIPTED_SOURCES:
         found = resolve_policy(wanted, config)
-        return Source(found.policy, found.origin, wanted)
+        return Source(found.policy, found.origin, scripted_digest(config))
     if wanted not in ("auto", "train"):
         return _from_path(config, Path(wanted))
-    if config.shift != "none":
-        return _nominal_run(config, preset, runs_dir)
-    source_task = SOURCE_OF[config.task]
+    source_task = source_task_of(config)
+    source_config = dataclasses.replace(make_config(source_task, preset), seed=config.seed)
+    options = getattr(config, source_task)
+    as_shipped = options == getattr(source_config, source_task)
     shipped = f"policies/{source_task}.npz"
-    if wanted == "auto" and preset != "debug":
+    if wanted == "auto" and preset != "debug" and as_shipped:
         try:
             path = asset_path(*shipped.split("/"))
         except FileNotFoundError:
@@ -129,15 +134,24 @@ def find_source(config: TrainConfig, preset: str, runs_dir: Path, say: Say) -> S
         else:
             say(f"source: the shipped policy assets/{shipped} (--source train trains your own)")
             return _from_path(config, path)
-    source_config = dataclasses.replace(make_config(source_task, preset), seed=config.seed)
+    source_config = dataclasses.replace(source_config, **{source_task: options})
     source_dir = runs_dir / rundir.default_name(source_config, preset)
     say(f"stage 1 of 3: source policy, task {source_task}, in {source_dir}")
     return _from_path(config, run(source_config, preset, runs_dir, None, say))
 
 
+def scripted_digest(config: TrainConfig) -> str:
+    """Return what identifies a scripted source: its name, and the content of a clip it plays."""
+    if config.source != "clip":
+        return config.source
+    content = load_clip(config.imitate.clip).qpos.tobytes()
+    return f"clip {hashlib.sha256(content).hexdigest()[:12]}"
+
+
 def _nominal_run(config: TrainConfig, preset: str, runs_dir: Path) -> Source:
     """Return the finished run of the same task without a shift."""
-    nominal = dataclasses.replace(config, shift="none", variant="twirl", source="auto")
+    variant = make_config(config.task, preset).variant
+    nominal = dataclasses.replace(config, shift="none", variant=variant)
     presets = (preset, *(p for p in PRESETS if p != preset))
     tried = [runs_dir / rundir.default_name(nominal, p) for p in presets]
     for run_dir in tried:
@@ -168,11 +182,17 @@ def source_data(config: TrainConfig, run_dir: Path, source: Source, say: Say) ->
     """
     env = make_env(config)
     if config.shift != "none" and source.run_dir is not None:
+        task = source.numpy_policy.header.task
+        if task != config.task:
+            raise ValueError(
+                f"{source.run_dir} is a run of task {task}: its replay is no experience of"
+                f" {config.task} (nearest: a run of {config.task}, or its policy file"
+                f" {source.run_dir / 'policy.npz'}, which is rolled out anew)"
+            )
         rows = load_replay(source.run_dir)
         data = ring.from_rows(jnp.asarray(rows), env.observation_size, env.action_size)
         say(f"source data: the replay of {source.run_dir}, {len(rows):,} transitions")
         return data
-    rundir.open_run(run_dir, config)
     path = run_dir / "source.npz"
     size = config.replay.source_size
     digest = collection_digest(config, source)
@@ -198,7 +218,7 @@ def collection_digest(config: TrainConfig, source: Source) -> str:
         "task": config.task,
         "shift": [config.shift, config.shift_strength],
         "options": dataclasses.asdict(config)[config.task],
-        "env": dataclasses.asdict(config.env),
+        "env": {k: v for k, v in dataclasses.asdict(config.env).items() if k != "engine"},
         "seed": config.seed,
         "size": config.replay.source_size,
         "noise": config.replay.source_noise,
@@ -232,6 +252,32 @@ def describe(means: dict[str, float]) -> str:
     return ", ".join(f"{k} {v:.3g}" for k, v in means.items()) or "no episode ended"
 
 
+def check_weights_fit(config: TrainConfig, preset: str) -> None:
+    """Refuse a variant that needs the networks of a source that cannot fit, before any stage.
+
+    Raises:
+        ValueError: The default source observes differently.
+    """
+    needs = config.variant in ("weights", "twirl+weights")
+    if needs and config.source in ("auto", "train") and not starts_from_nominal_run(config, preset):
+        task = source_task_of(config)
+        check_layouts(config, task, f"the source task {task}")
+
+
+def check_layouts(config: TrainConfig, task: str, origin: str) -> None:
+    """Check that a policy of ``task`` observes what ``config.task`` shows.
+
+    Raises:
+        ValueError: It does not; the message names ``origin``.
+    """
+    own = make_task(dataclasses.replace(config, task=task)).observer.layout
+    if own != make_task(config).observer.layout:
+        raise ValueError(
+            f"{origin} observes as task {task}, not as {config.task}:"
+            " its weights do not fit (nearest variant: 'twirl')"
+        )
+
+
 def source_weights(
     config: TrainConfig, source: Source, say: Say
 ) -> Callable[[DroqState], DroqState]:
@@ -245,12 +291,15 @@ def source_weights(
     policy = source.numpy_policy
     if not isinstance(policy, NumpyPolicy):
         raise ValueError(f"{source.origin} has no network weights (nearest variant: 'twirl')")
-    layout = make_task(config).observer.layout
-    own = make_task(dataclasses.replace(config, task=policy.header.task)).observer.layout
-    if own != layout:
+    check_layouts(config, policy.header.task, source.origin)
+    sizes = tuple(
+        len(policy.actor_params[name]["bias"]) for name in hidden_layers(policy.actor_params)
+    )
+    if sizes != config.droq.hidden_sizes:
         raise ValueError(
-            f"{source.origin} observes as task {policy.header.task}, not as {config.task}:"
-            " its weights do not fit (nearest variant: 'twirl')"
+            f"{source.origin} has hidden layers of {sizes} units, this run"
+            f" {config.droq.hidden_sizes} (nearest: --droq.hidden-sizes"
+            f" {' '.join(map(str, sizes))})"
         )
     actor = jax.tree.map(jnp.asarray, dict(policy.actor_params))
     learner = load_learner(source.run_dir) if source.run_dir else None
@@ -258,12 +307,6 @@ def source_weights(
         say(f"weights: the actor of {source.origin}; a policy file has no critics")
 
     def initial(fresh: DroqState) -> DroqState:
-        shapes = jax.tree.map(lambda x: x.shape, (fresh.actor, actor))
-        if shapes[0] != shapes[1]:
-            raise ValueError(
-                f"{source.origin} has layers {shapes[1]}, this run {shapes[0]}: set"
-                " droq.hidden_sizes alike"
-            )
         if learner is None:
             return fresh.replace(actor=actor)
         return fresh.replace(
@@ -280,7 +323,6 @@ def zero_shot(config: TrainConfig, run_dir: Path, source: Source, say: Say) -> P
     """Evaluate the source policy in the target task without training it."""
     from twirl_mjx.evaluation.rollout import make_evaluate
 
-    rundir.open_run(run_dir, config)
     env = make_env(config, num_envs=config.eval.final_episodes)
 
     def act(params: Any, memory: Any, state: Any, key: jax.Array) -> tuple[jax.Array, Any]:

@@ -19,6 +19,7 @@ from twirl_mjx import config_json
 from twirl_mjx.config import TASKS, TrainConfig
 
 CONFIG_NAME = "config.json"
+SOURCE_NAME = "source.json"
 VERSIONS_NAME = "versions.json"
 LOCK_NAME = ".lock"
 PACKAGES = (
@@ -97,17 +98,26 @@ def may_change(config: TrainConfig) -> tuple[str, ...]:
     return (*MAY_CHANGE, *(f"{task}." for task in TASKS if task not in read))
 
 
-def open_run(run_dir: Path, config: TrainConfig) -> None:
+def open_run(run_dir: Path, config: TrainConfig, source: dict[str, str] | None = None) -> None:
     """Create a run directory, or check that an existing one belongs to this config.
 
+    Args:
+        run_dir: The directory.
+        config: The run.
+        source: ``origin`` and ``digest`` of the source, where the run has one.
+
     Raises:
-        RunMismatchError: Another task or config lives there; the message has the differences.
+        RunMismatchError: Another task, config or source lives there; the message has the
+            differences.
     """
     path = run_dir / CONFIG_NAME
     if path.exists():
         old = config_json.from_json(path.read_text())
         changed, free = config_json.diff(old, config), may_change(config)
         lines = [line for line in changed if not line.startswith(free)]
+        known = read_source(run_dir)
+        if source and known and known["digest"] != source["digest"]:
+            lines += [f"source {key}: {known[key]!r} -> {source[key]!r}" for key in source]
         if lines:
             shown = "\n  ".join(lines)
             raise RunMismatchError(
@@ -116,7 +126,15 @@ def open_run(run_dir: Path, config: TrainConfig) -> None:
             )
     run_dir.mkdir(parents=True, exist_ok=True)
     _write(path, config_json.to_json(config))
+    if source:
+        _write(run_dir / SOURCE_NAME, json.dumps(source, indent=2, sort_keys=True) + "\n")
     _write(run_dir / VERSIONS_NAME, json.dumps(versions(), indent=2, sort_keys=True) + "\n")
+
+
+def read_source(run_dir: Path) -> dict[str, str] | None:
+    """Return ``origin`` and ``digest`` of a run's source, None when it has (or recorded) none."""
+    path = run_dir / SOURCE_NAME
+    return json.loads(path.read_text()) if path.is_file() else None
 
 
 def read_config(run_dir: Path) -> TrainConfig:
