@@ -18,7 +18,7 @@ GRID = (
 )
 
 SMALL = {
-    "total_env_steps": 9600,
+    "total_env_steps": 6400,
     "warmup_env_steps": 800,
     "epoch_env_steps": 1600,
     "env.num_envs": 32,
@@ -46,6 +46,6 @@ REDUCED = (
 )
 
 REDUCED_NOTE = (
-    "9.6k of 100k transitions, UTD 1 of 20, networks 2 x 128 of 2 x 256, 2 of 3 seeds that share "
+    "6.4k of 100k transitions, UTD 1 of 20, networks 2 x 128 of 2 x 256, 2 of 3 seeds that share "
     "one nominal run, 32 of 100 final episodes"
 )
