@@ -56,7 +56,7 @@ def resolve_policy(name: str, config: TrainConfig, *, noise: bool = False) -> Re
     if size != loaded.observation_size:
         raise ValueError(
             f"{name} takes observations of {loaded.observation_size} numbers, task {task} shows"
-            f" {size}: its policies need another file"
+            f" {size} (nearest: a policy trained for {task} by this version)"
         )
     act = _act_of(loaded, noise)
     foreign = own.task != config.task
