@@ -135,3 +135,10 @@ def test_diff_names_every_field_that_differs() -> None:
 def test_task_options_are_checked(build: Callable[[], object], match: str) -> None:
     with pytest.raises(ValueError, match=match):
         build()
+
+
+def test_departures_ignore_fields_at_their_default() -> None:
+    assert config_json.departures(TrainConfig()) == {}
+    config = dataclasses.replace(TrainConfig(), seed=3, droq=DroqConfig(utd=1.0))
+    assert config_json.departures(config) == {"seed": 3, "droq.utd": 1.0}
+    assert config_json.departures(config.droq) == {"utd": 1.0}

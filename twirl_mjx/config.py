@@ -127,9 +127,15 @@ class BipedConfig:
     """m, the drawn distance is clipped from above."""
     fixed_goal: tuple[float, float] = (1.5, 0.0)
     """m, the goal when the course is fixed (dynamics shifts); on the hill in ``sloped``."""
+    distance_reward: Literal["nearer", "speed"] = "nearer"
+    """Pay 0.5 for being nearer than a step before (the paper's), or by the speed of approach."""
+    distance_weight: float = 1.0
+    """Factor on the distance term; above 1 in an easier task whose policy is a source."""
 
     def __post_init__(self) -> None:
-        """Check every number, or raise ValueError."""
+        """Check every option, or raise ValueError."""
+        check_choice("biped.distance_reward", self.distance_reward, ("nearer", "speed"))
+        check_range("biped.distance_weight", self.distance_weight, 0.0, 100.0)
         check_range("biped.goal_mean_radius", self.goal_mean_radius, 0.0, 100.0)
         check_range("biped.goal_max_radius", self.goal_max_radius, 0.0, 100.0)
         check_range("biped.goal_min_radius", self.goal_min_radius, 0.0, self.goal_max_radius)

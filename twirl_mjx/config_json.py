@@ -50,8 +50,17 @@ def diff(a: TrainConfig, b: TrainConfig) -> list[str]:
     return [f"{k}: {flat_a[k]!r} -> {flat_b[k]!r}" for k in flat_a if flat_a[k] != flat_b[k]]
 
 
-def flatten(config: TrainConfig) -> dict[str, Any]:
-    """Return the config as a flat dict with dotted keys."""
+def departures(config: Any) -> dict[str, Any]:
+    """Return the fields of a config (or a part of one) that are not the default, flat.
+
+    What identifies a config: a field that a later version adds, at its default, changes nothing.
+    """
+    default = flatten(type(config)())
+    return {key: value for key, value in flatten(config).items() if value != default[key]}
+
+
+def flatten(config: Any) -> dict[str, Any]:
+    """Return a config (or a part of one) as a flat dict with dotted keys."""
 
     def walk(value: Any, prefix: str) -> dict[str, Any]:
         if not dataclasses.is_dataclass(value):

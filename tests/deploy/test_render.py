@@ -13,9 +13,16 @@ from PIL import Image
 from twirl_mjx.deploy import gl as gl_probe
 from twirl_mjx.deploy import render
 from twirl_mjx.deploy.rehearsal import IDEAL
-from twirl_mjx.deploy.render import CameraView, RenderError, look_at_path, render_frames
+from twirl_mjx.deploy.render import (
+    CameraView,
+    RenderError,
+    SceneRenderer,
+    look_at_path,
+    render_frames,
+)
 from twirl_mjx.deploy.robot import build_model
 from twirl_mjx.deploy.video import overlay_text, strip_indices, write_strip, write_video
+from twirl_mjx.sim.scene import BUMP_CELL, BUMP_HALF_SIZE, build_scene
 
 SIZE = (96, 64)
 
@@ -163,3 +170,21 @@ def test_bad_pictures_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"needs a \.png name"):
         write_strip(tmp_path / "s.png", [])
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.usefixtures("gl")
+def test_bumps_are_coloured_by_their_height() -> None:
+    scene = build_scene("bumpy")
+    model = scene.mj_model
+    model.light_active[:] = 0  # flat light: only the ground's own colour is left
+    model.vis.headlight.ambient[:], model.vis.headlight.diffuse[:] = 1.0, 0.0
+    view = CameraView(distance=1.0, azimuth=90.0, elevation=-89.9)
+    away = model.key("home").qpos + np.array([20.0, 20.0, 5.0, *np.zeros(16)])
+    points = np.random.default_rng(0).integers(40, 160, size=(12, 2))
+    with SceneRenderer(model, 32, 32) as renderer:
+        seen = [
+            renderer.draw(away, view, np.array([*(cell[::-1] * BUMP_CELL - BUMP_HALF_SIZE), 0.03]))
+            for cell in points
+        ]
+    brightness = [frame[14:18, 14:18].mean() for frame in seen]
+    assert np.corrcoef(brightness, scene.bumps[points[:, 0], points[:, 1]])[0, 1] > 0.9

@@ -11,7 +11,7 @@ import pytest
 from twirl_mjx.sim import a1, scene
 from twirl_mjx.sim.dynamics import SceneKind
 from twirl_mjx.sim.engine import write_physics
-from twirl_mjx.sim.scene import Scene, SimOptions, build_scene, terrain_height
+from twirl_mjx.sim.scene import Bands, Scene, SimOptions, build_scene, terrain_height
 
 
 @pytest.fixture(scope="module")
@@ -57,7 +57,9 @@ def test_hill_equals_rays(scenes: dict[str, Scene], degrees: float) -> None:
     angle = float(np.deg2rad(degrees))
     ours = our_heights(scenes["sloped"], xy, angle, 0.0)
     np.testing.assert_allclose(ours, ray_heights(scenes["sloped"], xy, angle, 0.0), atol=2e-6)
-    np.testing.assert_allclose(ours, scene.ground_height("sloped", xy, angle), atol=2e-6)
+    np.testing.assert_allclose(
+        ours, np.tan(angle) * np.maximum(xy[..., 0] - scene.HILL_START, 0.0), atol=2e-6
+    )
 
 
 def test_hill_by_hand(scenes: dict[str, Scene]) -> None:
@@ -136,17 +138,17 @@ def test_contact_friction_is_the_ground_s(scenes: dict[str, Scene], friction: fl
 
 
 def test_hurdles_are_drawn_on_the_ground_without_contact() -> None:
-    built = build_scene("sloped", hurdles=(0.3, 2.5))
+    built = build_scene("sloped", bands=Bands((0.3, 2.5)))
     data = mujoco.MjData(built.mj_model)
     mujoco.mj_forward(built.mj_model, data)
     for i, x in enumerate((0.3, 2.5)):
         geom = built.mj_model.geom(f"hurdle_{i}")
         assert geom.contype[0] == geom.conaffinity[0] == 0
         np.testing.assert_allclose(2 * geom.size[[0, 2]], [0.2, 0.01])
-        z = scene.ground_height("sloped", np.array([x, 0.0]), np.deg2rad(8))
-        np.testing.assert_allclose(data.geom_xpos[geom.id], [x, 0.0, z + 0.005], atol=1e-9)
+        z = np.tan(np.deg2rad(8)) * max(x - 0.5, 0.0)
+        np.testing.assert_allclose(data.geom_xpos[geom.id], [x, 0.0, z + 0.005], atol=1e-6)
         slope = data.geom_xmat[geom.id].reshape(3, 3)[2, 0]  # rise of the band's own x-axis
-        assert slope == pytest.approx(np.sin(np.deg2rad(8)) if x > 0.5 else 0.0, abs=1e-9)
+        assert slope == pytest.approx(np.sin(np.deg2rad(8)) if x > 0.5 else 0.0, abs=1e-6)
 
 
 def test_goal_marker_moves_and_touches_nothing() -> None:

@@ -67,6 +67,23 @@ def test_distance_progress(distance: float, previous: float, value: float) -> No
     assert float(result) == pytest.approx(value)
 
 
+@pytest.mark.parametrize(
+    ("distance", "previous", "value"),
+    [
+        (0.01, 0.02, 1.0),  # at the goal
+        (1.0, 1.025, 0.5),  # 0.5 m/s: the whole bonus
+        (1.0, 1.1, 0.5),  # never more
+        (1.0, 1.005, 0.1),  # 0.1 m/s
+        (1.0, 1.0, 0.0),
+        (1.005, 1.0, -0.1),  # away: swaying sums to nothing
+        (1.5, 1.0, -0.5),
+    ],
+)
+def test_approach_speed(distance: float, previous: float, value: float) -> None:
+    result = rewards.approach_speed(jnp.float32(distance), jnp.float32(previous), 0.05)
+    assert float(result) == pytest.approx(value, abs=1e-4)
+
+
 @pytest.mark.parametrize(("speed", "value"), [(0.51, 1.0), (0.5, 0.007), (-2.0, 0.007)])
 def test_forward(speed: float, value: float) -> None:
     assert float(rewards.forward(jnp.float32(speed))) == pytest.approx(value)

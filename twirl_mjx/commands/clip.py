@@ -19,7 +19,7 @@ from twirl_mjx.motion.formats import read_clip, write_clip
 from twirl_mjx.motion.leap import make_leap
 from twirl_mjx.motion.leap_checks import require_leap
 from twirl_mjx.motion.leap_config import LeapConfig
-from twirl_mjx.sim.scene import build_scene
+from twirl_mjx.sim.scene import Bands, build_scene
 
 FRAME_DT = 0.025
 """s between the frames of a film, half speed at 20 frames per second."""
@@ -77,7 +77,7 @@ def _show(argv: list[str]) -> int:
     show_lib.show(clips[0], f"{stem}.png")
     written = [f"{stem}.png"]
     times = np.arange(0.0, 2 * clips[0].cycle_duration, FRAME_DT)
-    model = build_scene(hurdles=(BAND_X,)).mj_model
+    model = build_scene(bands=Bands((BAND_X,))).mj_model
     film = Path(f"{stem}-film")
     written += map(
         str, render_episode(model, configurations(clips[0], times), film, frame_dt=FRAME_DT)

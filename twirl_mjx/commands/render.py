@@ -16,6 +16,8 @@ from twirl_mjx.deploy.render import render_episode
 from twirl_mjx.evaluation.record import Recording, record_episode, scene_model
 from twirl_mjx.policies.resolve import resolve_policy
 from twirl_mjx.presets import make_config
+from twirl_mjx.sim import look
+from twirl_mjx.sim.dynamics import make_dynamics
 from twirl_mjx.training import rundir
 
 
@@ -59,7 +61,7 @@ def film(config: TrainConfig, options: RenderOptions, stem: Path) -> Path:
     recording = record_episode(config, found.policy, seed=options.seed, steps=steps)
     stem.parent.mkdir(parents=True, exist_ok=True)
     video, strip = render_episode(
-        scene_model(config, recording.hurdles),
+        scene_model(config, recording),
         recording.qpos,
         stem,
         panels=options.panels,
@@ -79,10 +81,13 @@ def captions(config: TrainConfig, recording: Recording) -> list[list[str]]:
         "hurdles": ("hurdles_passed",),
     }[config.task]
     total = np.cumsum(recording.reward)
-    shift = "" if config.shift == "none" else f" ({config.shift})"
+    shift = look.describe(
+        config.shift, make_dynamics(config.shift, config.shift_strength), recording.leg_strength
+    )
+    title = f"{config.task}, {shift}" if shift else config.task
     return [
         [
-            f"{config.task}{shift}  {0.05 * (t + 1):5.2f} s",
+            f"{title}  {0.05 * (t + 1):5.2f} s",
             f"return {total[t]:.0f}  "
             + "  ".join(f"{k} {recording.metrics[k][t]:.2f}" for k in shown),
         ]

@@ -6,11 +6,19 @@ import dataclasses
 from typing import Any
 
 import jax
+import mujoco
 import numpy as np
 
 from twirl_mjx.config import TrainConfig
+from twirl_mjx.sim import look
+from twirl_mjx.sim.dynamics import get_shift, make_dynamics
+from twirl_mjx.sim.engine import world_model
+from twirl_mjx.sim.scene import Bands, build_scene
 from twirl_mjx.tasks.registry import make_env
 from twirl_mjx.types import SourcePolicy
+
+BANDS_AHEAD = 4.0
+"""m, bands are drawn up to this far beyond the farthest point of the way."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -26,7 +34,9 @@ class Recording:
     metrics: dict[str, np.ndarray]
     """Per-step task metrics, each [T]."""
     hurdles: tuple[float, ...]
-    """x of the hurdle bands of the episode, m; empty in tasks without."""
+    """x of the hurdle bands up to just beyond the way gone, m; empty in tasks without."""
+    leg_strength: np.ndarray
+    """[4] in [0, 1] of the episode, order FR FL RR RL."""
 
 
 def record_episode(
@@ -46,6 +56,7 @@ def record_episode(
     memory = policy.init(state)
     task_state: Any = state.world.task
     hurdles = np.asarray(getattr(task_state, "positions", np.zeros((1, 0))))[0]
+    strength = np.asarray(state.world.motors.strength[0]).reshape(4, 3).min(axis=1)
 
     @jax.jit
     def step(state: Any, memory: Any, key: jax.Array) -> tuple[Any, Any]:
@@ -68,16 +79,20 @@ def record_episode(
             break
     qpos, goals, reward = (np.stack(column) for column in zip(*rows, strict=True))
     stacked = jax.tree.map(lambda *x: np.stack(x), *metrics)
-    return Recording(qpos, goals, reward, stacked, tuple(float(x) for x in hurdles))
+    reached = hurdles[hurdles < qpos[:, 0].max() + BANDS_AHEAD]
+    return Recording(qpos, goals, reward, stacked, tuple(map(float, reached)), strength)
 
 
-def scene_model(config: TrainConfig, hurdles: tuple[float, ...] = ()) -> Any:
-    """Return the ``mujoco.MjModel`` to draw a config's episodes in."""
-    from twirl_mjx.sim.dynamics import get_shift, make_dynamics
-    from twirl_mjx.sim.scene import build_scene
-
-    scene = build_scene(get_shift(config.shift).scene, hurdles=hurdles)
-    if scene.kind == "bumpy":
-        height = float(make_dynamics(config.shift, config.shift_strength).bump_height)
-        scene.mj_model.hfield_size[0, 2] = max(height, 1e-4)
-    return scene.mj_model
+def scene_model(config: TrainConfig, recording: Recording) -> mujoco.MjModel:
+    """Return the model to draw an episode in: its ground, bands and colours."""
+    dynamics = make_dynamics(config.shift, config.shift_strength)
+    bands = Bands(
+        recording.hurdles,
+        y=float(recording.qpos[0, 1]),
+        incline=float(dynamics.incline),
+        bump_height=float(dynamics.bump_height),
+    )
+    scene = build_scene(get_shift(config.shift).scene, bands=bands)
+    model = world_model(scene, dynamics)
+    look.paint(model, dynamics, recording.leg_strength)
+    return model

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
+from collections.abc import Callable, Iterator
 from typing import Literal
 
 import jax
@@ -13,7 +14,7 @@ import mujoco
 import numpy as np
 from mujoco import mjx
 
-from twirl_mjx.sim import a1
+from twirl_mjx.sim import a1, look
 from twirl_mjx.sim.dynamics import SceneKind
 
 CollisionSet = Literal["feet", "legs", "full"]
@@ -39,8 +40,13 @@ HURDLE_LENGTH = 0.2
 """m, extent of a hurdle band along x (paper, section "Jumping Task")."""
 HURDLE_HEIGHT = 0.01
 """m, height of a hurdle band."""
-HURDLE_DRAWN_HALF_WIDTH = 1.5
+DRAWN_HALF_WIDTH = 1.5
 """m, half the drawn extent in y of a band, which is endless for the task."""
+BUMPY_PIECES = (2, 20)
+"""Pieces in x and y of which a band on a heightfield is drawn, each lying on its own ground."""
+
+HeightOf = Callable[[np.ndarray], np.ndarray]
+"""Ground height [K] in m under world positions [K, 2]."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -72,6 +78,20 @@ class SimOptions:
     def n_substeps(self) -> int:
         """Physics steps in a control step."""
         return round(CONTROL_DT / self.sim_dt)
+
+
+@dataclasses.dataclass(frozen=True)
+class Bands:
+    """Hurdle bands to draw; the task tests contact with them itself."""
+
+    x: tuple[float, ...]
+    """m, world x of the centres."""
+    y: float = 0.0
+    """m, world y of the middle of the drawn part."""
+    incline: float = math.radians(8.0)
+    """rad, of the hill of a ``sloped`` scene."""
+    bump_height: float = 0.05
+    """m, of a ``bumpy`` scene."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -109,7 +129,6 @@ def _add_ground(spec: mujoco.MjSpec, kind: SceneKind) -> tuple[str, ...]:
         priority=1,
         condim=3,
         friction=[1.0, 0.005, 0.0001],
-        material="ground",
     )
     if kind == "bumpy":
         bumps = unit_bumps()
@@ -121,80 +140,67 @@ def _add_ground(spec: mujoco.MjSpec, kind: SceneKind) -> tuple[str, ...]:
             userdata=bumps.ravel(),
         )
         world.add_geom(
-            name="floor", type=mujoco.mjtGeom.mjGEOM_HFIELD, hfieldname="bumps", **common
+            name="floor",
+            type=mujoco.mjtGeom.mjGEOM_HFIELD,
+            hfieldname="bumps",
+            material="ground",
+            **common,
         )
         return ("floor",)
-    world.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 0.05], **common)
+    plane = mujoco.mjtGeom.mjGEOM_PLANE
+    world.add_geom(name="floor", type=plane, size=[0, 0, 0.05], material="ground", **common)
     if kind == "flat":
         return ("floor",)
     angle = math.radians(8.0)
     # The plane is drawn 24 m long; for contacts it is endless. Both half-spaces unite.
     world.add_geom(
         name="hill",
-        type=mujoco.mjtGeom.mjGEOM_PLANE,
+        type=plane,
         size=[12.0, 6.0, 0.05],
         pos=[HILL_START, 0.0, 0.0],
         quat=[math.cos(-angle / 2), 0.0, math.sin(-angle / 2), 0.0],
+        material="hill",
         **common,
     )
     return ("floor", "hill")
 
 
-def _add_look(spec: mujoco.MjSpec) -> None:
-    spec.add_texture(
-        name="ground",
-        type=mujoco.mjtTexture.mjTEXTURE_2D,
-        builtin=mujoco.mjtBuiltin.mjBUILTIN_CHECKER,
-        rgb1=[0.80, 0.83, 0.86],
-        rgb2=[0.70, 0.74, 0.78],
-        width=256,
-        height=256,
-    )
-    material = spec.add_material(name="ground", texrepeat=[2, 2], texuniform=True, reflectance=0.05)
-    material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "ground"
-    spec.add_texture(
-        name="sky",
-        type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
-        builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT,
-        rgb1=[0.93, 0.96, 1.0],
-        rgb2=[0.55, 0.66, 0.78],
-        width=128,
-        height=128,
-    )
-    spec.worldbody.add_light(
-        pos=[0, 0, 6],
-        dir=[0.2, 0.3, -1.0],
-        type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
-        diffuse=[0.7, 0.7, 0.7],
-        castshadow=True,
-    )
-    spec.visual.headlight.ambient = [0.35, 0.35, 0.35]
-    spec.visual.global_.offwidth = 1280
-    spec.visual.global_.offheight = 960
+def _add_bands(spec: mujoco.MjSpec, kind: SceneKind, bands: Bands, height_of: HeightOf) -> None:
+    """Add boxes ``hurdle_<band>`` (or ``_<piece>``) on the ground, without contact."""
+    pieces = BUMPY_PIECES if kind == "bumpy" else (1, 1)
+    half = np.array([HURDLE_LENGTH / 2, DRAWN_HALF_WIDTH]) / pieces
+    for i, x in enumerate(bands.x):
+        for j, centre in enumerate(_centres(np.array([x, bands.y]), half, pieces)):
+            around = centre + np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]]) * half
+            height = height_of(around)
+            slope_x = math.atan2(height[1] - height[2], 2 * half[0])
+            slope_y = math.atan2(height[3] - height[4], 2 * half[1])
+            name = f"hurdle_{i}" if pieces == (1, 1) else f"hurdle_{i}_{j}"
+            spec.worldbody.add_geom(
+                name=name,
+                type=mujoco.mjtGeom.mjGEOM_BOX,
+                size=[*half, HURDLE_HEIGHT / 2],
+                pos=[*centre, height[0] + HURDLE_HEIGHT / 2],
+                quat=_tilt(slope_x, slope_y),
+                contype=0,
+                conaffinity=0,
+                rgba=[0.90, 0.33, 0.12, 1.0],
+            )
 
 
-def ground_height(scene_kind: SceneKind, xy: np.ndarray, incline: float = 0.0) -> np.ndarray:
-    """Return the height [...] in m of flat or sloped ground under ``xy`` [..., 2] (numpy)."""
-    if scene_kind == "sloped":
-        return np.tan(incline) * np.maximum(xy[..., 0] - HILL_START, 0.0)
-    return np.zeros(xy.shape[:-1])
+def _centres(middle: np.ndarray, half: np.ndarray, pieces: tuple[int, int]) -> Iterator[np.ndarray]:
+    for ix in range(pieces[0]):
+        for iy in range(pieces[1]):
+            yield middle + (2 * np.array([ix, iy]) + 1 - np.array(pieces)) * half
 
 
-def _add_hurdles(spec: mujoco.MjSpec, kind: SceneKind, hurdles: tuple[float, ...]) -> None:
-    angle = math.radians(8.0) if kind == "sloped" else 0.0
-    for i, x in enumerate(hurdles):
-        z = float(ground_height(kind, np.array([x, 0.0]), angle))
-        tilt = -angle if x > HILL_START else 0.0
-        spec.worldbody.add_geom(
-            name=f"hurdle_{i}",
-            type=mujoco.mjtGeom.mjGEOM_BOX,
-            size=[HURDLE_LENGTH / 2, HURDLE_DRAWN_HALF_WIDTH, HURDLE_HEIGHT / 2],
-            pos=[x, 0.0, z + HURDLE_HEIGHT / 2],
-            quat=[math.cos(tilt / 2), 0.0, math.sin(tilt / 2), 0.0],
-            contype=0,
-            conaffinity=0,
-            rgba=[0.90, 0.33, 0.12, 1.0],
-        )
+def _tilt(slope_x: float, slope_y: float) -> np.ndarray:
+    """Return the quaternion [4] of a plate that rises by these angles in rad along x and y."""
+    about_y = np.array([math.cos(-slope_x / 2), 0.0, math.sin(-slope_x / 2), 0.0])
+    about_x = np.array([math.cos(slope_y / 2), math.sin(slope_y / 2), 0.0, 0.0])
+    quat = np.empty(4)
+    mujoco.mju_mulQuat(quat, about_y, about_x)
+    return quat
 
 
 def _enable_collisions(spec: mujoco.MjSpec, collision: CollisionSet) -> None:
@@ -211,7 +217,7 @@ def build_scene(
     collision: CollisionSet = "legs",
     options: SimOptions | None = None,
     goal_marker: bool = False,
-    hurdles: tuple[float, ...] = (),
+    bands: Bands | None = None,
 ) -> Scene:
     """Build and compile a scene with ``mujoco.MjSpec``.
 
@@ -220,49 +226,52 @@ def build_scene(
         collision: Robot geoms the contact solver sees.
         options: Physics settings.
         goal_marker: Add a mocap body ``goal`` with a visible, untouchable pole.
-        hurdles: x positions in m of drawn hurdle bands (no contact: the task tests them).
+        bands: Hurdle bands to draw.
 
     Returns:
         The compiled scene.
     """
     options = options or SimOptions()
+    bumps = unit_bumps() if kind == "bumpy" else np.zeros((1, 1), np.float32)
     spec = mujoco.MjSpec.from_file(str(a1.xml_path()))
-    _add_look(spec)
+    look.add_look(spec, kind, bumps)
     ground = _add_ground(spec, kind)
     _enable_collisions(spec, collision)
-    _add_hurdles(spec, kind, hurdles)
     if goal_marker:
-        goal = spec.worldbody.add_body(name="goal", mocap=True)
-        goal.add_geom(
-            type=mujoco.mjtGeom.mjGEOM_CYLINDER,
-            size=[0.06, 0.005, 0],
-            contype=0,
-            conaffinity=0,
-            rgba=[0.10, 0.65, 0.25, 0.9],
-            pos=[0, 0, 0.005],
-        )
-        goal.add_geom(
-            type=mujoco.mjtGeom.mjGEOM_CAPSULE,
-            size=[0.008, 0.15, 0],
-            contype=0,
-            conaffinity=0,
-            rgba=[0.10, 0.65, 0.25, 0.6],
-            pos=[0, 0, 0.15],
-        )
+        _add_goal_marker(spec)
     spec.option.timestep = options.sim_dt
     spec.option.iterations = options.iterations
     spec.option.ls_iterations = options.ls_iterations
-    model = spec.compile()
-    bumps = unit_bumps() if kind == "bumpy" else np.zeros((1, 1), np.float32)
-    if kind == "bumpy":  # the compiler has scaled them to the full height
-        model.hfield_data[:] = bumps.ravel() * (BUMP_HEIGHT / MAX_BUMP_HEIGHT)
-    return Scene(
-        kind=kind,
-        options=options,
-        mj_model=model,
-        ground_geoms=tuple(model.geom(name).id for name in ground),
-        bumps=bumps,
+
+    def compiled() -> Scene:
+        model = spec.compile()
+        if kind == "bumpy":  # the compiler has scaled them to the full height
+            model.hfield_data[:] = bumps.ravel() * (BUMP_HEIGHT / MAX_BUMP_HEIGHT)
+        ids = tuple(model.geom(name).id for name in ground)
+        return Scene(kind=kind, options=options, mj_model=model, ground_geoms=ids, bumps=bumps)
+
+    scene = compiled()
+    if bands is None:
+        return scene
+    shape = jnp.float32(bands.incline), jnp.float32(bands.bump_height)
+    _add_bands(
+        spec, kind, bands, lambda xy: np.asarray(terrain_height(scene, jnp.asarray(xy), *shape))
     )
+    return compiled()
+
+
+def _add_goal_marker(spec: mujoco.MjSpec) -> None:
+    goal = spec.worldbody.add_body(name="goal", mocap=True)
+    cylinder, capsule = mujoco.mjtGeom.mjGEOM_CYLINDER, mujoco.mjtGeom.mjGEOM_CAPSULE
+    for shape, size, alpha in ((cylinder, [0.06, 0.005, 0], 0.9), (capsule, [0.008, 0.15, 0], 0.6)):
+        goal.add_geom(
+            type=shape,
+            size=size,
+            contype=0,
+            conaffinity=0,
+            rgba=[0.10, 0.65, 0.25, alpha],
+            pos=[0, 0, size[1]],
+        )
 
 
 def terrain_height(

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from twirl_mjx.config import TrainConfig
 from twirl_mjx.sim import a1, frames
 from twirl_mjx.sim.dynamics import Dynamics
-from twirl_mjx.sim.scene import CollisionSet, Scene
+from twirl_mjx.sim.scene import CONTROL_DT, CollisionSet, Scene
 from twirl_mjx.tasks import base, rewards
 from twirl_mjx.tasks.observations import ProprioceptiveObserver
 
@@ -72,6 +72,11 @@ class Biped:
             task=BipedState(previous_distance=jnp.linalg.norm(goal - qpos[:2])),
         )
 
+    def _progress(self, distance: jax.Array, previous: jax.Array) -> jax.Array:
+        if self._config.biped.distance_reward == "speed":
+            return rewards.approach_speed(distance, previous, CONTROL_DT)
+        return rewards.distance_progress(distance, previous)
+
     def judge(self, world: base.World, view: base.View, scene: Scene) -> base.Outcome:
         """Score one control step."""
         x_axis, _, z_axis = frames.base_axes(view.qpos[3:7])
@@ -79,10 +84,11 @@ class Biped:
         distance = jnp.linalg.norm(displacement)
         upright, bonus = rewards.normalised_cosine(x_axis[2]), rewards.height_bonus(view.height)
         facing = rewards.normalised_cosine(rewards.facing_cosine(z_axis, displacement))
-        progress = rewards.distance_progress(distance, world.task.previous_distance)
+        progress = self._progress(distance, world.task.previous_distance)
+        weight = self._config.biped.distance_weight
         fall = base.touches(view, a1.TRUNK, a1.HIP, a1.THIGH)
         return base.Outcome(
-            reward=(upright + bonus) * (1.0 + facing + progress),
+            reward=(upright + bonus) * (1.0 + facing + weight * progress),
             terminated=fall,
             goal=world.goal,
             task=BipedState(previous_distance=distance),

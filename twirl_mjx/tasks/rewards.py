@@ -40,6 +40,21 @@ def distance_progress(distance: jax.Array, previous: jax.Array) -> jax.Array:
     return jnp.where(distance <= 0.01, 1.0, jnp.where(distance < previous, 0.5, 0.0))
 
 
+FULL_APPROACH_SPEED = 0.5
+"""m/s, speed towards the goal that earns the whole of :func:`approach_speed`."""
+
+
+def approach_speed(distance: jax.Array, previous: jax.Array, control_dt: float) -> jax.Array:
+    """Return 1 within 0.01 m of the goal, else 0.5 times the speed towards it over 0.5 m/s.
+
+    The graded form of :func:`distance_progress`: swaying on the spot earns nothing on average,
+    where the paper's form pays it half of the bonus. In [-0.5, 0.5] away from the goal.
+    """
+    speed = (previous - distance) / control_dt
+    graded = 0.5 * jnp.clip(speed / FULL_APPROACH_SPEED, -1.0, 1.0)
+    return jnp.where(distance <= 0.01, 1.0, graded)
+
+
 def forward(speed: jax.Array) -> jax.Array:
     """Return 1 when the base moves along x faster than 0.5 m/s, else 0.007 (paper, "Forward")."""
     return jnp.where(speed > 0.5, 1.0, 0.007)

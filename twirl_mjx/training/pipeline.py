@@ -18,6 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from twirl_mjx import config_json
 from twirl_mjx.assets import asset_path
 from twirl_mjx.config import SCRIPTED_SOURCES, TrainConfig
 from twirl_mjx.droq.state import DroqState
@@ -214,11 +215,12 @@ def source_data(config: TrainConfig, run_dir: Path, source: Source, say: Say) ->
 
 def collection_digest(config: TrainConfig, source: Source) -> str:
     """Return a hash of everything that decides a collected dataset."""
+    env = config_json.departures(config.env)
     decides = {
         "task": config.task,
         "shift": [config.shift, config.shift_strength],
-        "options": dataclasses.asdict(config)[config.task],
-        "env": {k: v for k, v in dataclasses.asdict(config.env).items() if k != "engine"},
+        "options": config_json.departures(getattr(config, config.task)),
+        "env": {k: v for k, v in env.items() if k != "engine"},
         "seed": config.seed,
         "size": config.replay.source_size,
         "noise": config.replay.source_noise,

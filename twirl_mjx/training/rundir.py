@@ -88,8 +88,9 @@ def default_name(config: TrainConfig, preset: str) -> str:
 
 
 def digest(config: TrainConfig) -> str:
-    """Return a short hash that identifies a resolved config."""
-    return hashlib.sha256(config_json.to_json(config).encode()).hexdigest()[:12]
+    """Return a short hash that identifies a resolved config, in later versions too."""
+    identity = json.dumps(config_json.departures(config), sort_keys=True)
+    return hashlib.sha256(identity.encode()).hexdigest()[:12]
 
 
 def may_change(config: TrainConfig) -> tuple[str, ...]:
