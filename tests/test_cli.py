@@ -37,6 +37,8 @@ def test_unknown_command_suggests_the_nearest(capsys: pytest.CaptureFixture[str]
         (["train", "--task", "biped", "--preset", "debug", "--shift", "icy"], "nominal run"),
         (["render", "nowhere"], "no policy at nowhere"),
         (["evaluate", "trot"], "give --task"),
+        (["evaluate", "trot", "--task", "biped", "--goal-distance", "0"], "nearest: 0.01"),
+        (["evaluate", "trot", "--task", "hurdles", "--hurdle-gap", "1"], "nearest: 1.4"),
     ],
 )
 def test_bad_input_is_refused_before_anything_is_written(
@@ -84,3 +86,12 @@ def test_whole_method_on_the_debug_preset(tmp_path: Path) -> None:
     again = subprocess.run(command, capture_output=True, text=True, timeout=280, check=False)
     assert again.returncode == 0, again.stderr[-2000:]
     assert "compiling" not in again.stdout, "a finished pipeline ran again"
+
+
+def test_output_that_nobody_reads_is_no_crash() -> None:
+    command = [sys.executable, "-m", "twirl_mjx", "train", "--help"]
+    run = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    assert run.stdout is not None
+    run.stdout.close()
+    assert "Traceback" not in run.communicate(timeout=120)[1]
+    assert run.returncode in (0, 141)  # 0 where the whole text fits into the pipe's buffer

@@ -68,7 +68,7 @@ def main(argv: list[str] | None = None) -> int:
 
     Returns:
         Exit status: 0 done; 1 it failed; 2 unusable arguments; 130 stopped by a signal after
-        saving.
+        saving; 141 nobody reads the output.
     """
     argv = list(sys.argv[1:] if argv is None else argv)
     if not argv or argv[0] in ("-h", "--help"):
@@ -90,6 +90,9 @@ def main(argv: list[str] | None = None) -> int:
     except RuntimeError as error:
         print(f"twirl {name}: {error}", file=sys.stderr)
         return 130 if type(error).__name__ == "StoppedError" else 1
+    except BrokenPipeError:  # the reader of our output, `| head` say, has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 141
     except KeyboardInterrupt:
         print(f"twirl {name}: interrupted", file=sys.stderr)
         return 130

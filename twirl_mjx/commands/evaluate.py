@@ -7,7 +7,7 @@ import dataclasses
 import sys
 import time
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
 import tyro
@@ -17,16 +17,20 @@ from rich.table import Table
 from twirl_mjx.checks import check_choice, check_range
 from twirl_mjx.commands.options import parse, say
 from twirl_mjx.commands.render import config_of
-from twirl_mjx.config import SHIFTS
+from twirl_mjx.config import SHIFTS, TrainConfig
 from twirl_mjx.evaluation.shifts import evaluate_shifts
 from twirl_mjx.figures.statistics import bootstrap
 from twirl_mjx.policies.resolve import resolve_policy
+from twirl_mjx.tasks.bands import MIN_GAP
 from twirl_mjx.training.loop import EVAL_COLUMNS
+
+MEDIANS = ("min_distance",)
+"""Measures of which the table shows the median, as the paper does: goals lie at all distances."""
 
 
 @dataclasses.dataclass(frozen=True)
 class EvaluateOptions:
-    """Evaluate policies across dynamics conditions on one fixed course."""
+    """Evaluate policies across dynamics conditions, on one fixed course unless told otherwise."""
 
     policies: Annotated[tuple[str, ...], tyro.conf.Positional]
     """Run directories, policy files (.npz, .onnx) or scripted names (trot, bound, zero, random)."""
@@ -36,6 +40,12 @@ class EvaluateOptions:
     """Conditions."""
     strength: float = 1.0
     """Strength of every shift: 0 nominal, 1 the paper's value."""
+    course: Literal["fixed", "random"] = "fixed"
+    """One course for all episodes, or goals and hurdles drawn as in training without a shift."""
+    goal_distance: float | None = None
+    """m, distance of every goal of ``biped``; that of the policy's config by default."""
+    hurdle_gap: float | None = None
+    """m, gap between all hurdles of ``hurdles``; that of the policy's config by default."""
     episodes: int = 100
     """Episodes per condition and policy."""
     seed: int = 2_000_003
@@ -66,9 +76,28 @@ def main(argv: list[str]) -> int:
     return 0
 
 
+def on_course(config: TrainConfig, options: EvaluateOptions) -> TrainConfig:
+    """Return the config with the goals and hurdles that the options ask for.
+
+    Raises:
+        ValueError: A distance out of range.
+    """
+    biped, hurdles = config.biped, config.hurdles
+    if (goal := options.goal_distance) is not None:
+        check_range("goal_distance", goal, 0.01, 100.0)
+        biped = dataclasses.replace(
+            biped, fixed_goal=(goal, 0.0), goal_min_radius=goal, goal_max_radius=goal
+        )
+    if (gap := options.hurdle_gap) is not None:
+        check_range("hurdle_gap", gap, MIN_GAP, 100.0)
+        hurdles = dataclasses.replace(hurdles, fixed_gap=gap, min_gap=gap, max_gap=gap)
+    env = dataclasses.replace(config.env, course=options.course)
+    return dataclasses.replace(config, biped=biped, hurdles=hurdles, env=env)
+
+
 def _evaluate_one(name: str, options: EvaluateOptions) -> list[list[object]]:
     path = Path(name)
-    config = config_of(name, options.task)
+    config = on_course(config_of(name, options.task), options)
     found = resolve_policy(name, config)
     began = time.monotonic()
     values = evaluate_shifts(
@@ -98,8 +127,9 @@ def _evaluate_one(name: str, options: EvaluateOptions) -> list[list[object]]:
 def _print_table(title: str, values: dict[str, dict[str, np.ndarray]]) -> None:
     """Print mean of every measure, and mean and IQM of the return with a 95 % interval."""
     measures = [m for m in next(iter(values.values())) if m != "return"]
+    titles = [f"{m} (median)" if m in MEDIANS else m for m in measures]
     table = Table(title=title)
-    for column in ("condition", "return (mean)", "return IQM [95 %]", *measures):
+    for column in ("condition", "return (mean)", "return IQM [95 %]", *titles):
         table.add_column(column, justify="left" if column == "condition" else "right")
     for shift, found in values.items():
         iqm = bootstrap([found["return"]])
@@ -107,7 +137,7 @@ def _print_table(title: str, values: dict[str, dict[str, np.ndarray]]) -> None:
             shift,
             f"{found['return'].mean():.1f}",
             f"{iqm.estimate:.1f} [{iqm.low:.1f}, {iqm.high:.1f}]",
-            *(f"{found[m].mean():.3g}" for m in measures),
+            *(f"{(np.median if m in MEDIANS else np.mean)(found[m]):.3g}" for m in measures),
         )
     Console(width=None if sys.stdout.isatty() else 160).print(table)
 

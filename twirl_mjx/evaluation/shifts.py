@@ -33,13 +33,13 @@ def evaluate_shifts(
     shifts: tuple[str, ...] = tuple(SHIFTS),
     strength: float = 1.0,
 ) -> dict[str, dict[str, np.ndarray]]:
-    """Evaluate a policy under several conditions on one fixed course.
+    """Evaluate a policy under several conditions on one course, the config's or the fixed one.
 
     Episode ``e`` of every condition starts from the same draws, so that conditions differ by
     their physics alone (and by the ground under the start).
 
     Args:
-        config: Task and its options; its shift is ignored.
+        config: Task and its options; its shift is ignored, and its course is fixed if ``auto``.
         policy: Any policy that acts in the task's worlds.
         episodes: E, episodes per condition.
         seed: Seed of the episodes.
@@ -53,10 +53,11 @@ def evaluate_shifts(
     def act(params: Any, memory: Any, state: Any, key: jax.Array) -> tuple[jax.Array, Any]:
         return policy.act(memory, state, key)
 
-    fixed = dataclasses.replace(config, env=dataclasses.replace(config.env, course="fixed"))
+    course = "fixed" if config.env.course == "auto" else config.env.course
+    config = dataclasses.replace(config, env=dataclasses.replace(config.env, course=course))
     found: dict[str, dict[str, np.ndarray]] = {}
     for kind, names in scenes_of(shifts).items():
-        env = make_env(fixed, num_envs=episodes * len(names), scene_kind=kind)
+        env = make_env(config, num_envs=episodes * len(names), scene_kind=kind)
         dynamics = stack([make_dynamics(name, strength) for name in names], episodes)
         index = jnp.tile(jnp.arange(episodes), len(names))
         values = make_evaluate(env, policy.init, act)(None, jax.random.key(seed), dynamics, index)

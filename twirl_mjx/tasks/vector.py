@@ -21,6 +21,12 @@ from twirl_mjx.types import Metrics, Transition
 MAX_STATE = 1e4
 """A world whose position or velocity exceeds this (SI units) counts as diverged."""
 
+PHYSICS_STATE = ("time", "qpos", "qvel", "ctrl", "qacc_warmstart")
+"""Fields of ``mjx.Data`` that the next step depends on; it computes the others anew."""
+
+Live = tuple[dict[str, jax.Array], World, jax.Array]
+"""What a restart changes: ``PHYSICS_STATE``, the rest of the worlds, what the policy sees."""
+
 
 class EnvState(flax.struct.PyTreeNode):
     """State of N worlds between two control steps; reset and step return identical shapes."""
@@ -121,7 +127,8 @@ class VectorEnv:
         index = jnp.arange(self.num_envs) if index is None else index
         keys = jax.vmap(jax.random.fold_in, (None, 0))(key, index)
         qpos, qvel, world, obs = jax.vmap(self._start_world)(keys, dynamics)
-        data = _place(make_data(self.scene, self.num_envs), qpos, qvel)
+        data = make_data(self.scene, self.num_envs)
+        data = data.replace(qpos=qpos, qvel=qvel, ctrl=qpos[:, 7:])
         flags = jnp.zeros(self.num_envs, bool)
         return EnvState(
             data=data,
@@ -167,7 +174,11 @@ class VectorEnv:
             },
             world=world,
         )
-        return jax.lax.cond(jnp.any(ended.done), self._restart, lambda s: s, ended)
+        live = ({name: getattr(data, name) for name in PHYSICS_STATE}, world, next_obs)
+        restart = functools.partial(self._restart, ended.done)
+        # Only what a restart changes goes through: a conditional copies whatever it hands on.
+        physics, world, obs = jax.lax.cond(jnp.any(ended.done), restart, lambda x: x, live)
+        return ended.replace(data=data.replace(**physics), world=world, obs=obs)
 
     def _start_world(
         self, key: jax.Array, dynamics: Dynamics
@@ -210,26 +221,19 @@ class VectorEnv:
         )
         return world, obs, outcome, finite
 
-    def _restart(self, state: EnvState) -> EnvState:
+    def _restart(self, done: jax.Array, live: Live) -> Live:
         """Start new episodes in the worlds whose episode ended; leave the others untouched."""
-        done = state.done
-        qpos, qvel, world, obs = jax.vmap(self._start_world)(state.world.key, state.world.dynamics)
-        fresh = _place(make_data(self.scene, self.num_envs), qpos, qvel)
-        return state.replace(
-            data=_select(done, fresh, state.data),
-            world=_select(done, world, state.world),
-            obs=_select(done, obs, state.obs),
-        )
+        physics, world, _ = live
+        qpos, qvel, fresh_world, fresh_obs = jax.vmap(self._start_world)(world.key, world.dynamics)
+        fresh = {name: jnp.zeros_like(leaf) for name, leaf in physics.items()}
+        fresh |= {"qpos": qpos, "qvel": qvel, "ctrl": qpos[:, 7:]}
+        return _select(done, (fresh, fresh_world, fresh_obs), live)
 
 
 def _command(world: World, action: jax.Array) -> tuple[World, actuation.MotorCommand]:
     target, filter_state = actuation.filter_step(world.filter, actuation.action_to_target(action))
     command = actuation.motor_command(world.motors, target)
     return world.replace(filter=filter_state, action=action), command
-
-
-def _place(data: mjx.Data, qpos: jax.Array, qvel: jax.Array) -> mjx.Data:
-    return data.replace(qpos=qpos, qvel=qvel, ctrl=qpos[:, 7:])
 
 
 def _select[T](mask: jax.Array, new: T, old: T) -> T:

@@ -1,0 +1,46 @@
+"""Courses that ``twirl evaluate`` can be asked for."""
+
+from __future__ import annotations
+
+import jax
+import numpy as np
+import pytest
+
+from twirl_mjx.commands.evaluate import EvaluateOptions, on_course
+from twirl_mjx.presets import make_config
+from twirl_mjx.tasks.registry import make_env
+
+
+def goals(options: EvaluateOptions) -> np.ndarray:
+    env = make_env(on_course(make_config("biped"), options), num_envs=8)
+    return np.asarray(env.reset(jax.random.key(0)).world.goal)
+
+
+def bands(options: EvaluateOptions) -> np.ndarray:
+    env = make_env(on_course(make_config("hurdles"), options), num_envs=4)
+    return np.asarray(env.reset(jax.random.key(0)).world.task.positions)
+
+
+def test_fixed_goal_is_straight_ahead() -> None:
+    np.testing.assert_allclose(goals(EvaluateOptions(())), [[1.5, 0.0]] * 8)
+    np.testing.assert_allclose(goals(EvaluateOptions((), goal_distance=1.0)), [[1.0, 0.0]] * 8)
+
+
+def test_random_goals_of_one_distance_lie_all_around() -> None:
+    found = goals(EvaluateOptions((), course="random", goal_distance=1.0))
+    np.testing.assert_allclose(np.linalg.norm(found, axis=1), 1.0, rtol=1e-5)
+    assert np.ptp(np.arctan2(found[:, 1], found[:, 0])) > 1.0
+
+
+@pytest.mark.parametrize("course", ["fixed", "random"])
+def test_hurdles_are_a_given_gap_apart(course: str) -> None:
+    found = bands(EvaluateOptions((), course=course, hurdle_gap=2.8))  # type: ignore[arg-type]
+    np.testing.assert_allclose(np.diff(found, axis=1), 2.8, rtol=1e-4)
+    np.testing.assert_allclose(found[:, 0], 2.8, rtol=1e-4)
+
+
+def test_random_hurdles_are_those_of_training() -> None:
+    gaps = np.diff(bands(EvaluateOptions((), course="random")), axis=1)
+    assert gaps.min() >= 1.6 - 1e-4
+    assert gaps.max() <= 2.6 + 1e-4
+    assert np.ptp(gaps) > 0.5
