@@ -1,0 +1,64 @@
+"""Chains of runs: every link starts from the one before it, and a chain goes on where it ended."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from twirl_mjx import cli
+from twirl_mjx.commands.curriculum import CHAINS, CurriculumOptions, plan
+from twirl_mjx.config import SHIFTS
+from twirl_mjx.presets import make_config
+from twirl_mjx.training import rundir
+
+
+@pytest.mark.parametrize("task", CHAINS)
+@pytest.mark.parametrize("preset", ["paper", "cpu", "debug"])
+def test_every_link_starts_from_the_one_before_and_shifts_from_the_target(
+    task: str, preset: str
+) -> None:
+    links = plan(CurriculumOptions(task=task, seed=3, runs=Path("r")), preset)  # type: ignore[arg-type]
+    names, configs = zip(*links, strict=True)
+    own = len(CHAINS[task])
+    assert len(set(names)) == len(names) == own + 5
+    assert configs[0].source == make_config(configs[0].task, preset).source
+    for name, config in zip(names[: own - 1], configs[1:own], strict=True):
+        assert config.source == f"r/{name}"
+    target = configs[own - 1]
+    assert (target.task, target.biped, target.hurdles) == (
+        task, make_config(task, preset).biped, make_config(task, preset).hurdles,
+    )  # fmt: skip
+    assert [config.shift for config in configs[own:]] == list(SHIFTS[1:])
+    assert {config.source for config in configs[own:]} == {f"r/{names[own - 1]}"}
+    assert all(config.total_env_steps <= 100_000 for config in configs[own:])
+    assert {config.seed for config in configs} == {3}
+
+
+def test_walk_differs_from_biped_in_reward_and_episode_length_only() -> None:
+    links = plan(CurriculumOptions(shifts=()), "cpu")
+    _, (_, walk), (_, biped) = links
+    assert (walk.biped.distance_reward, walk.biped.distance_weight) == ("speed", 4.0)
+    assert (biped.biped.distance_reward, biped.biped.distance_weight) == ("nearer", 1.0)
+    assert walk.droq == biped.droq
+
+
+def test_unknown_shift_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["curriculum", "--preset", "debug", "--shifts", "icey"]) == 2
+    assert "nearest: 'icy'" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_a_chain_runs_and_is_not_repeated(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ["curriculum", "--preset", "debug", "--shifts", "icy", "--runs", str(tmp_path)]
+    assert cli.main(command) == 0
+    names = [name for name, _ in plan(CurriculumOptions(shifts=("icy",), runs=tmp_path), "debug")]
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(names)
+    source = rundir.read_source(tmp_path / "biped-icy-chain-debug-s0")
+    assert source is not None
+    assert source["origin"] == str(tmp_path / "biped-chain-debug-s0")
+    capsys.readouterr()
+    assert cli.main(command) == 0
+    assert "".join(capsys.readouterr()).count("is finished") == len(names)
