@@ -22,6 +22,7 @@ def test_every_link_starts_from_the_one_before_and_shifts_from_the_target(
     names, configs = zip(*links, strict=True)
     own = len(CHAINS[task])
     assert len(set(names)) == len(names) == own + 5
+    assert names[0] == rundir.default_name(configs[0], preset)
     assert configs[0].source == make_config(configs[0].task, preset).source
     for name, config in zip(names[: own - 1], configs[1:own], strict=True):
         assert config.source == f"r/{name}"
@@ -35,12 +36,13 @@ def test_every_link_starts_from_the_one_before_and_shifts_from_the_target(
     assert {config.seed for config in configs} == {3}
 
 
-def test_walk_differs_from_biped_in_reward_and_episode_length_only() -> None:
+def test_walk_has_an_easier_reward_and_biped_the_paper_s() -> None:
     links = plan(CurriculumOptions(shifts=()), "cpu")
     _, (_, walk), (_, biped) = links
     assert (walk.biped.distance_reward, walk.biped.distance_weight) == ("speed", 4.0)
     assert (biped.biped.distance_reward, biped.biped.distance_weight) == ("nearer", 1.0)
-    assert walk.droq == biped.droq
+    assert walk.droq.target_entropy == biped.droq.target_entropy == -12.0
+    assert walk.droq.learning_rate == pytest.approx(3 * biped.droq.learning_rate)
 
 
 def test_unknown_shift_is_refused(capsys: pytest.CaptureFixture[str]) -> None:

@@ -13,7 +13,7 @@ from twirl_mjx.commands.options import default_preset, parse, say
 from twirl_mjx.config import SHIFTS, TrainConfig
 from twirl_mjx.presets import PRESETS, make_config
 from twirl_mjx.sweep.grid import configure
-from twirl_mjx.training import pipeline
+from twirl_mjx.training import pipeline, rundir
 from twirl_mjx.training.loop import EVAL_CSV
 
 ADAPTATION_ENV_STEPS = 100_000
@@ -33,7 +33,15 @@ CHAINS: dict[str, tuple[tuple[str, dict[str, Any]], ...]] = {
                 "droq.target_entropy": -12.0,
             },
         ),
-        ("biped", {"task": "biped", "variant": "twirl+weights", "droq.target_entropy": -12.0}),
+        (
+            "biped",
+            {
+                "task": "biped",
+                "variant": "twirl+weights",
+                "droq.target_entropy": -12.0,
+                "droq.learning_rate": 1e-4,
+            },
+        ),
     ),
     "hurdles": (("imitate", {"task": "imitate"}), ("hurdles", {"task": "hurdles"})),
 }
@@ -67,7 +75,9 @@ def plan(options: CurriculumOptions, preset: str) -> list[tuple[str, TrainConfig
     for name, settings in CHAINS[options.task]:
         source = {"source": str(options.runs / links[-1][0])} if links else {}
         config = configure(preset, settings | source | {"seed": options.seed}, f"link {name}")
-        links.append((f"{name}-chain-{preset}-s{options.seed}", config))
+        chained = f"{name}-chain-{preset}-s{options.seed}"
+        # The first link is the run of `twirl train`, which may be there already.
+        links.append((chained if links else rundir.default_name(config, preset), config))
     target, config = links[-1]
     source_task = make_config(options.task, preset)
     budget = min(ADAPTATION_ENV_STEPS, source_task.total_env_steps)

@@ -46,6 +46,8 @@ class EvaluateOptions:
     """m, distance of every goal of ``biped``; that of the policy's config by default."""
     hurdle_gap: float | None = None
     """m, gap between all hurdles of ``hurdles``; that of the policy's config by default."""
+    engine: Literal["auto", "mjx", "native"] = "auto"
+    """Physics engine: MJX, or C MuJoCo in threads; auto as in training."""
     episodes: int = 100
     """Episodes per condition and policy."""
     seed: int = 2_000_003
@@ -77,7 +79,7 @@ def main(argv: list[str]) -> int:
 
 
 def on_course(config: TrainConfig, options: EvaluateOptions) -> TrainConfig:
-    """Return the config with the goals and hurdles that the options ask for.
+    """Return the config with the goals, hurdles and engine that the options ask for.
 
     Raises:
         ValueError: A distance out of range.
@@ -91,7 +93,7 @@ def on_course(config: TrainConfig, options: EvaluateOptions) -> TrainConfig:
     if (gap := options.hurdle_gap) is not None:
         check_range("hurdle_gap", gap, MIN_GAP, 100.0)
         hurdles = dataclasses.replace(hurdles, fixed_gap=gap, min_gap=gap, max_gap=gap)
-    env = dataclasses.replace(config.env, course=options.course)
+    env = dataclasses.replace(config.env, course=options.course, engine=options.engine)
     return dataclasses.replace(config, biped=biped, hurdles=hurdles, env=env)
 
 
