@@ -74,7 +74,13 @@ def test_conditions_together_equal_conditions_alone(config) -> None:
 def test_recording_has_one_row_per_step(config) -> None:
     recording = record_episode(config, get_scripted("zero"), seed=0, steps=5)
     assert recording.qpos.shape == (5, 19)
-    assert recording.goals.shape == (5, 2)
+    assert recording.goals.shape == (5, 3)
     assert recording.metrics["cosine"].shape == (5,)
     assert recording.hurdles == ()
     assert np.isfinite(recording.qpos).all()
+
+
+def test_goals_of_a_recording_lie_on_the_hill(config) -> None:
+    sloped = dataclasses.replace(config, shift="sloped")
+    goals = record_episode(sloped, get_scripted("zero"), seed=0, steps=2).goals
+    np.testing.assert_allclose(goals, [[1.5, 0.0, np.tan(np.deg2rad(8.0))]] * 2, rtol=1e-5)

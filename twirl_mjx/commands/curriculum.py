@@ -19,6 +19,13 @@ from twirl_mjx.training.loop import EVAL_CSV
 ADAPTATION_ENV_STEPS = 100_000
 """Transitions of an adaptation run (paper, section "Transfer to New Environments")."""
 
+POLISH = {
+    "variant": "twirl+weights",
+    "droq.target_entropy": -12.0,
+    "droq.learning_rate": 1e-4,
+}
+"""Less exploration noise and smaller steps, for a skill that is there already."""
+
 CHAINS: dict[str, tuple[tuple[str, dict[str, Any]], ...]] = {
     "biped": (
         ("stand", {"task": "stand"}),
@@ -33,21 +40,18 @@ CHAINS: dict[str, tuple[tuple[str, dict[str, Any]], ...]] = {
                 "droq.target_entropy": -12.0,
             },
         ),
-        (
-            "biped",
-            {
-                "task": "biped",
-                "variant": "twirl+weights",
-                "droq.target_entropy": -12.0,
-                "droq.learning_rate": 1e-4,
-            },
-        ),
+        ("biped", {"task": "biped"} | POLISH),
     ),
-    "hurdles": (("imitate", {"task": "imitate"}), ("hurdles", {"task": "hurdles"})),
+    "hurdles": (
+        ("imitate", {"task": "imitate"}),
+        ("hurdles", {"task": "hurdles"}),
+        ("polish", {"task": "hurdles"} | POLISH),
+    ),
 }
 """Per target task: name and settings of every link, on top of the preset. ``walk`` is ``biped``
 with an easier reward: its distance term is graded and four times as large, because leaning towards
-the goal earns little in the paper's reward as long as it costs balance."""
+the goal earns little in the paper's reward as long as it costs balance. ``polish`` goes on with
+TWiRL's networks and its own experience."""
 
 
 @dataclasses.dataclass(frozen=True)

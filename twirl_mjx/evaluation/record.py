@@ -6,6 +6,7 @@ import dataclasses
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 
@@ -14,6 +15,7 @@ from twirl_mjx.sim import look
 from twirl_mjx.sim.dynamics import get_shift, make_dynamics
 from twirl_mjx.sim.engine import world_model
 from twirl_mjx.sim.scene import Bands, build_scene
+from twirl_mjx.tasks.base import ground_at
 from twirl_mjx.tasks.registry import make_env
 from twirl_mjx.types import SourcePolicy
 
@@ -28,7 +30,7 @@ class Recording:
     qpos: np.ndarray
     """[T, 19] at the end of every control step; the last state before the episode ended."""
     goals: np.ndarray
-    """[T, 2] m."""
+    """[T, 3] m, on the ground."""
     reward: np.ndarray
     """[T]."""
     metrics: dict[str, np.ndarray]
@@ -63,11 +65,16 @@ def record_episode(
         action, memory = policy.act(memory, state, key)
         return env.step(state, action), memory
 
+    @jax.jit
+    def place(goal: jax.Array) -> jax.Array:
+        dynamics = jax.tree.map(lambda leaf: leaf[0], env.dynamics)
+        return jnp.append(goal, ground_at(env.scene, dynamics, goal))
+
     rows: list[tuple[np.ndarray, ...]] = []
     metrics: list[dict[str, np.ndarray]] = []
     keys = jax.random.split(act_key, steps or config.env.episode_length)
     for key in keys:
-        goal = np.asarray(state.world.goal[0])
+        goal = np.asarray(place(state.world.goal[0]))
         before = np.asarray(state.data.qpos[0])
         state, memory = step(state, memory, key)
         ended = bool(state.done[0])
