@@ -139,6 +139,6 @@ def test_task_options_are_checked(build: Callable[[], object], match: str) -> No
 
 def test_departures_ignore_fields_at_their_default() -> None:
     assert config_json.departures(TrainConfig()) == {}
-    config = dataclasses.replace(TrainConfig(), seed=3, droq=DroqConfig(utd=1.0))
-    assert config_json.departures(config) == {"seed": 3, "droq.utd": 1.0}
-    assert config_json.departures(config.droq) == {"utd": 1.0}
+    config = dataclasses.replace(TrainConfig(), seed=3, droq=DroqConfig(tau=0.01))
+    assert config_json.departures(config) == {"seed": 3, "droq.tau": 0.01}
+    assert config_json.departures(config.droq) == {"tau": 0.01}
