@@ -31,6 +31,8 @@ class DemoOptions:
     """Folder of the films."""
     film: bool = True
     """Also film one episode of each."""
+    seconds: float = 10.0
+    """Longest film."""
 
 
 def main(argv: list[str]) -> int:
@@ -61,5 +63,6 @@ def _show(path: Path, options: DemoOptions) -> None:
     means = ", ".join(f"{name} {np.mean(value):.3g}" for name, value in values.items())
     say(f"{path.stem}: {means}")
     if options.film:
-        film(config, RenderOptions(str(path), seed=options.seed), options.out / path.stem)
+        wanted = RenderOptions(str(path), seed=options.seed, seconds=options.seconds)
+        film(config, wanted, options.out / path.stem)
     say(f"{path.stem}: {time.monotonic() - began:.0f} s")
