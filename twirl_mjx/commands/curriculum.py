@@ -11,7 +11,7 @@ import tyro
 from twirl_mjx.checks import check_choice
 from twirl_mjx.commands.options import default_preset, parse, say
 from twirl_mjx.config import SHIFTS, TrainConfig
-from twirl_mjx.presets import PRESETS, make_config
+from twirl_mjx.presets import PRESETS
 from twirl_mjx.sweep.grid import configure
 from twirl_mjx.training import pipeline, rundir
 from twirl_mjx.training.loop import EVAL_CSV
@@ -83,13 +83,11 @@ def plan(options: CurriculumOptions, preset: str) -> list[tuple[str, TrainConfig
         # The first link is the run of `twirl train`, which may be there already.
         links.append((chained if links else rundir.default_name(config, preset), config))
     target, config = links[-1]
-    source_task = make_config(options.task, preset)
-    budget = min(ADAPTATION_ENV_STEPS, source_task.total_env_steps)
+    budget = min(ADAPTATION_ENV_STEPS, config.total_env_steps)
     for shift in options.shifts:
         adapted = dataclasses.replace(
             config,
             shift=shift,
-            variant="twirl+weights",
             source=str(options.runs / target),
             total_env_steps=budget,
         )

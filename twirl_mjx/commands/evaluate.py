@@ -82,8 +82,11 @@ def on_course(config: TrainConfig, options: EvaluateOptions) -> TrainConfig:
     """Return the config with the goals, hurdles and engine that the options ask for.
 
     Raises:
-        ValueError: A distance out of range.
+        ValueError: A distance out of range, or of another task.
     """
+    for task, name in (("biped", "goal_distance"), ("hurdles", "hurdle_gap")):
+        if getattr(options, name) is not None and config.task != task:
+            raise ValueError(f"{name} is an option of task {task}, not of {config.task}")
     biped, hurdles = config.biped, config.hurdles
     if (goal := options.goal_distance) is not None:
         check_range("goal_distance", goal, 0.01, 100.0)
