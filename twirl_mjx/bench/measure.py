@@ -43,17 +43,36 @@ def sample_rates(call: Callable[[], object], work: float, seconds: float) -> lis
     Returns:
         Units per second of every sample.
     """
-    began = time.perf_counter()
-    call()
-    one = time.perf_counter() - began
-    calls = max(1, round(min(seconds / 5, MAX_SAMPLE_S) / max(one, 1e-9)))
-    deadline = time.perf_counter() + seconds
-    samples: list[float] = []
-    while len(samples) < MIN_SAMPLES or time.perf_counter() < deadline:
+    return sample_in_turn([call], work, seconds)[0]
+
+
+def sample_in_turn(
+    calls: Sequence[Callable[[], object]], work: float, seconds: float
+) -> list[list[float]]:
+    """Measure several functions in turn, so that a disturbance of the machine meets them all.
+
+    Args:
+        calls: Functions that do ``work`` units each, as in :func:`sample_rates`.
+        work: Units of one call.
+        seconds: Length of all measurements together in s.
+
+    Returns:
+        Units per second of every sample, per function; equally many.
+    """
+    length = min(seconds / len(calls) / 5, MAX_SAMPLE_S)
+    repeats = []
+    for call in calls:
         began = time.perf_counter()
-        for _ in range(calls):
-            call()
-        samples.append(calls * work / (time.perf_counter() - began))
+        call()
+        repeats.append(max(1, round(length / max(time.perf_counter() - began, 1e-9))))
+    deadline = time.perf_counter() + seconds
+    samples: list[list[float]] = [[] for _ in calls]
+    while len(samples[0]) < MIN_SAMPLES or time.perf_counter() < deadline:
+        for call, repeat, taken in zip(calls, repeats, samples, strict=True):
+            began = time.perf_counter()
+            for _ in range(repeat):
+                call()
+            taken.append(repeat * work / (time.perf_counter() - began))
     return samples
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import importlib.util
+import statistics
 import time
 from collections.abc import Callable
 from typing import Any, Literal
@@ -26,6 +27,7 @@ from twirl_mjx.bench.measure import (
     available_cpus,
     machine,
     progress,
+    sample_in_turn,
     sample_rates,
     summary,
 )
@@ -159,11 +161,12 @@ def measure_row(task: str, engine: str, num_envs: int, seconds: float) -> Record
     before = chain.state[0][0].data
     chain()
     targets = chain.state[1]
-    rates = summary(sample_rates(chain, STEPS * num_envs, seconds / 2))
     began = time.perf_counter()
     bare_call = (bare_mjx if engine == "mjx" else bare_native)(env, before, targets)
     bare_compile_s = time.perf_counter() - began
-    bare = summary(sample_rates(bare_call, STEPS * num_envs, seconds / 2))
+    whole_samples, bare_samples = sample_in_turn([chain, bare_call], STEPS * num_envs, seconds)
+    rates, bare = summary(whole_samples), summary(bare_samples)
+    ratios = [b / whole for whole, b in zip(whole_samples, bare_samples, strict=True)]
     substeps = env.scene.options.n_substeps
     return {
         "task": task,
@@ -172,7 +175,7 @@ def measure_row(task: str, engine: str, num_envs: int, seconds: float) -> Record
         "control_steps_per_s": rates["median"],
         "physics_steps_per_s": rates["median"] * substeps,
         "bare_physics_steps_per_s": bare["median"] * substeps,
-        "environment_overhead": bare["median"] / rates["median"] - 1.0,
+        "environment_overhead": statistics.median(ratios) - 1.0,
         "control_steps_spread": rates["spread"],
         "bare_spread": bare["spread"],
         "samples": rates["samples"],
