@@ -171,12 +171,13 @@ class HurdlesConfig:
     """m, largest distance."""
     fixed_gap: float = 2.1
     """m, distance when the course is fixed (dynamics shifts)."""
-    hurdle_bonus: Literal["count", "event"] = "count"
-    """Pay the number of hurdles passed so far at every step, or 1 when one is passed."""
+    hurdle_bonus: Literal["count", "event", "clean"] = "count"
+    """Pay the number of hurdles passed so far at every step, or 1 when one is passed, or the
+    number passed in a single flight so far at every step."""
 
     def __post_init__(self) -> None:
         """Check the bonus (the task checks the gaps), or raise ValueError."""
-        check_choice("hurdles.hurdle_bonus", self.hurdle_bonus, ("count", "event"))
+        check_choice("hurdles.hurdle_bonus", self.hurdle_bonus, ("count", "event", "clean"))
 
 
 @dataclasses.dataclass(frozen=True)

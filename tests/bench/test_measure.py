@@ -54,6 +54,20 @@ def test_slower_calls_give_lower_samples(clock: Clock) -> None:
     assert measure.sample_rates(work, work=2.0, seconds=0.1) == [2.0, 1.0, 0.5]
 
 
+def test_functions_are_measured_in_turn(clock: Clock) -> None:
+    order = []
+
+    def take(name: str, length: float) -> None:
+        order.append(name)
+        clock.now += length
+
+    fast, slow = measure.sample_in_turn(
+        [lambda: take("fast", 0.125), lambda: take("slow", 0.25)], work=1.0, seconds=0.5
+    )
+    assert (fast, slow) == ([8.0] * 3, [4.0] * 3)
+    assert order == ["fast", "slow"] * 4  # once to see how long a call takes
+
+
 def test_summary() -> None:
     found = measure.summary([4.0, 1.0, 2.0])
     assert found == {"median": 2.0, "spread": 1.5, "samples": [4.0, 1.0, 2.0]}

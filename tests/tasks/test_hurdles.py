@@ -122,10 +122,19 @@ def test_the_goal_switches_0_4_m_past_a_hurdle(passed: int, x: float, after: int
     np.testing.assert_allclose(out.goal, [POSITIONS[min(after, 2)], 0.5])
 
 
+CLEAN = judge_with(
+    Hurdles(dataclasses.replace(make_config("hurdles"), hurdles=HurdlesConfig(hurdle_bonus="clean")))
+)
+
+
 def test_count_pays_always_and_event_pays_once() -> None:
     config = make_config("hurdles")
     event = dataclasses.replace(config, hurdles=HurdlesConfig(hurdle_bonus="event"))
-    for judge, want in ((JUDGE, (0.0, 1.0, 1.0, 2.0)), (judge_with(Hurdles(event)), (0, 1, 0, 1))):
+    for judge, want in (
+        (JUDGE, (0.0, 1.0, 1.0, 2.0)),
+        (judge_with(Hurdles(event)), (0, 1, 0, 1)),
+        (CLEAN, (0.0, 1.0, 1.0, 2.0)),  # all feet stay in the air
+    ):
         state, got = task_state(), []
         for x in (2.3, 2.45, 2.6, 4.5):
             out = judge(state, flying(np.full(SUBSTEPS, x)))
@@ -134,6 +143,16 @@ def test_count_pays_always_and_event_pays_once() -> None:
             rest = sum(WEIGHTS[n] * float(out.metrics[n]) for n in WEIGHTS if n != "hurdle")
             assert float(out.reward) == pytest.approx(rest + 0.1 * got[-1])
         assert got == [*want]
+
+
+def test_a_step_over_a_hurdle_earns_no_clean_bonus() -> None:
+    state = task_state()
+    for x, z in ((2.0, a1.HOME_HEIGHT - 0.01), (2.5, 0.6), (4.5, 0.6)):
+        # On the ground astride the first hurdle, then flying over the second.
+        out = CLEAN(state, flying(np.full(SUBSTEPS, x), z))
+        state = out.task
+    assert (int(state.passed), float(out.metrics["hurdle"])) == (2, 1.0)
+    assert float(out.metrics["clean_clearances"]) == 1.0
 
 
 def test_a_touch_within_the_step_is_found() -> None:

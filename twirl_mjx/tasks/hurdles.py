@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from typing import Literal
 
 import flax.struct
 import jax
@@ -101,6 +102,15 @@ def next_goal(state: HurdlesState) -> jax.Array:
     return jnp.stack([state.positions[index], state.start[1]])
 
 
+def bonus(
+    kind: Literal["count", "event", "clean"], before: HurdlesState, after: HurdlesState
+) -> jax.Array:
+    """Return the hurdle term of a control step, see ``HurdlesConfig.hurdle_bonus``."""
+    if kind == "event":
+        return (after.passed - before.passed) * 1.0
+    return jnp.sum(after.cleared) * 1.0 if kind == "clean" else after.passed * 1.0
+
+
 class Hurdles:
     """See the module docstring."""
 
@@ -163,12 +173,11 @@ class Hurdles:
         """Score one control step."""
         crossing = watch(scene, world.dynamics, view.qpos_trace, world.task.positions)
         state = advance(world.task, crossing, view.qpos[0])
-        event = self._options.hurdle_bonus == "event"
         terms = {
             "forward": rewards.forward(view.qvel[0]),
             "orientation": rewards.orientation(frames.rotation_angle(view.qpos[3:7])),
             "joint_calm": rewards.joint_calm(view.qvel[6:]),
-            "hurdle": (state.passed - world.task.passed if event else state.passed) * 1.0,
+            "hurdle": bonus(self._options.hurdle_bonus, world.task, state),
         }
         goal = next_goal(state)
         fall = base.touches(view, a1.TRUNK)
