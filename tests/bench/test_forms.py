@@ -1,6 +1,8 @@
-"""Comparison of both forms of the learner: what counts as agreement, and what is refused."""
+"""Comparison of the forms of the learner: what counts as agreement, and what is refused."""
 
 from __future__ import annotations
+
+import dataclasses
 
 import numpy as np
 import pytest
@@ -18,11 +20,13 @@ def test_ranges_overlap_when_they_share_a_point() -> None:
 
 def test_forms_differ_in_nothing_but_the_form() -> None:
     options = FormsBench()
-    fast, plain = options.config("fast"), options.config("plain")
-    assert (fast.droq.fast, plain.droq.fast) == (True, False)
-    assert fast.variant == plain.variant == "scratch"
-    assert fast.replay == plain.replay
-    assert fast.env == plain.env
+    fast, plain, narrow = (options.config(form) for form in ("fast", "plain", "bfloat16"))
+    assert (fast.droq.fast, plain.droq.fast, narrow.droq.fast) == (True, False, True)
+    assert narrow.droq.matmul_dtype == "bfloat16"
+    for other in (plain, narrow):
+        assert dataclasses.replace(other, droq=fast.droq) == fast
+    assert dataclasses.replace(narrow.droq, matmul_dtype="float32") == fast.droq
+    assert fast.variant == "scratch"
 
 
 def test_too_short_runs_and_single_seeds_are_refused() -> None:
@@ -33,10 +37,12 @@ def test_too_short_runs_and_single_seeds_are_refused() -> None:
 
 
 def test_sheet_shows_means_and_ranges() -> None:
-    quarter = {"fast": [1.0, 3.0], "plain": [4.0, 6.0], "overlap": False}
+    quarter = {
+        "plain": [4.0, 6.0], "fast": [1.0, 3.0], "overlap": {"plain": True, "fast": False},
+    }  # fmt: skip
     record = {
         "quarters": [quarter], "seeds": 2, "task": "stand", "preset": "cpu", "env_steps": 48_000,
-        "critic_updates": 20_800, "wall_s": {"fast": 100.0, "plain": 180.0},
+        "critic_updates": 20_800, "wall_s": {"plain": 180.0, "fast": 100.0},
     }  # fmt: skip
     sheet = report.forms_sheet(record)
-    assert sheet.rows == (("1", "2.0 (1.0 to 3.0)", "5.0 (4.0 to 6.0)", "no"),)
+    assert sheet.rows == (("1", "5.0 (4.0 to 6.0)", "2.0 (1.0 to 3.0, apart)"),)

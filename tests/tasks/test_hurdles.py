@@ -123,7 +123,9 @@ def test_the_goal_switches_0_4_m_past_a_hurdle(passed: int, x: float, after: int
 
 
 CLEAN = judge_with(
-    Hurdles(dataclasses.replace(make_config("hurdles"), hurdles=HurdlesConfig(hurdle_bonus="clean")))
+    Hurdles(
+        dataclasses.replace(make_config("hurdles"), hurdles=HurdlesConfig(hurdle_bonus="clean"))
+    )
 )
 
 

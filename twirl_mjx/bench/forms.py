@@ -1,14 +1,15 @@
-"""Learning curves with the fast and with the plain form of the learner, at equal updates.
+"""Learning curves with the plain, the fast and the bfloat16 form of the learner, at equal updates.
 
-Both forms train the same seeds of one preset for the same transitions. They draw other random
-numbers (dropout bits above all), so the curves of one seed part after a while; what must agree is
-where the seeds of both forms lie.
+All forms train the same seeds of one preset for the same transitions. They draw other random
+numbers (dropout bits above all) or round otherwise, so the curves of one seed part after a while;
+what must agree is where the seeds of a form and those of the plain one lie.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import time
+from typing import Any
 
 import jax
 import numpy as np
@@ -20,14 +21,19 @@ from twirl_mjx.presets import PRESETS, make_config
 from twirl_mjx.tasks.registry import make_env
 from twirl_mjx.training import seeds
 
-FORMS = ("fast", "plain")
+FORMS: dict[str, dict[str, Any]] = {
+    "plain": {"fast": False},
+    "fast": {"fast": True},
+    "bfloat16": {"fast": True, "matmul_dtype": "bfloat16"},
+}
+"""Settings of the learner (``DroqConfig``); every form is compared with the first one."""
 QUARTERS = 4
 """Parts of the run whose mean returns are compared."""
 
 
 @dataclasses.dataclass(frozen=True)
 class FormsBench:
-    """Train with both forms of the learner and compare the returns, minutes."""
+    """Train with every form of the learner and compare the returns, minutes."""
 
     json: bool = False
     """Print one JSON document on stdout, and nothing else."""
@@ -55,7 +61,7 @@ class FormsBench:
     def config(self, form: str) -> TrainConfig:
         """Return the run with one form of the learner."""
         base = make_config(self.task, self.preset)
-        droq = dataclasses.replace(base.droq, fast=form == "fast")
+        droq = dataclasses.replace(base.droq, **FORMS[form])
         return dataclasses.replace(base, variant="scratch", droq=droq)
 
 
@@ -88,7 +94,7 @@ def overlap(a: np.ndarray, b: np.ndarray) -> bool:
 
 
 def measure(options: FormsBench) -> Record:
-    """Train with both forms; compare every quarter of the run."""
+    """Train with all forms; compare every quarter of the run."""
     record_machine = machine()
     found = {form: returns_of(options, form) for form in FORMS}
     quarters = []
@@ -99,7 +105,7 @@ def measure(options: FormsBench) -> Record:
         }
         quarters.append(
             {form: part.tolist() for form, part in parts.items()}
-            | {"overlap": overlap(parts["fast"], parts["plain"])}
+            | {"overlap": {form: overlap(parts[form], parts["plain"]) for form in parts}}
         )
     return {
         "part": "forms",

@@ -174,6 +174,25 @@ def make_bound(options: LearnerBench, layout: matmuls.Layout) -> tuple[Chain, in
     return Chain(run, first, tensors, donate=False), options.utd
 
 
+def make_bounds(options: LearnerBench) -> dict[matmuls.Layout, tuple[Chain, int]]:
+    """Compile the bare products in every layout that runs: on a CPU one lacks bfloat16.
+
+    Raises:
+        jax.errors.JaxRuntimeError: None runs.
+    """
+    bounds = {layout: make_bound(options, layout) for layout in matmuls.LAYOUTS}
+    refusals = []
+    for layout, (chain, _) in list(bounds.items()):
+        try:
+            chain()
+        except jax.errors.JaxRuntimeError as refusal:
+            refusals.append(refusal)
+            del bounds[layout]
+    if not bounds:
+        raise refusals[0]
+    return bounds
+
+
 def sbx_missing(options: LearnerBench) -> str | None:
     """Return why SBX cannot be measured, or None."""
     if not options.sbx:
@@ -222,7 +241,7 @@ def measure(options: LearnerBench) -> Record:
     batch, batch_updates = single, updates
     if options.num_seeds > 1:
         batch, batch_updates = make_learner(options, options.num_seeds)
-    bounds = {layout: make_bound(options, layout) for layout in matmuls.LAYOUTS}
+    bounds = make_bounds(options)
     kinds = 3 + sum(reason is None for reason in reasons.values())
     turn = options.seconds / options.rounds / kinds
     found: dict[str, list[float]] = {}
@@ -266,7 +285,7 @@ def _record(
     workers = [rate for name, rate in median.items() if name.startswith("worker ")]
     together = {"vmap": median["seeds"]} | ({"workers": sum(workers)} if workers else {})
     best = max(together, key=lambda name: together[name])
-    layout = max(matmuls.LAYOUTS, key=lambda name: median[name])
+    layout = max((name for name in matmuls.LAYOUTS if name in median), key=lambda n: median[n])
     shapes = matmuls.Shapes(options.obs, options.action, options.batch, options.hidden, options.utd)
     return {
         "part": "learner",

@@ -142,22 +142,26 @@ def epoch_sheet(record: Record) -> Sheet:
 
 
 def forms_sheet(record: Record) -> Sheet:
-    """Lay out the returns of both forms of the learner, a row per quarter of the run."""
+    """Lay out the returns of the forms of the learner, a row per quarter of the run."""
 
-    def text(values: Sequence[float]) -> str:
-        return f"{sum(values) / len(values):.1f} ({min(values):.1f} to {max(values):.1f})"
+    def text(form: str, part: Mapping[str, Any]) -> str:
+        values = part[form]
+        apart = "" if part["overlap"][form] else ", apart"
+        return f"{sum(values) / len(values):.1f} ({min(values):.1f} to {max(values):.1f}{apart})"
 
+    forms = list(record["wall_s"])
     rows = tuple(
-        (str(i + 1), text(part["fast"]), text(part["plain"]), "yes" if part["overlap"] else "no")
+        (str(i + 1), *(text(form, part) for form in forms))
         for i, part in enumerate(record["quarters"])
     )
+    walls = ", ".join(f"{form} {wall:.0f} s" for form, wall in record["wall_s"].items())
     note = (
-        f"mean episode return over {record['seeds']} seeds (range); {record['task']}, preset"
-        f" {record['preset']}, {record['env_steps']:,} transitions and"
-        f" {record['critic_updates']:,} critic updates of every seed, in"
-        f" {record['wall_s']['fast']:.0f} s fast and {record['wall_s']['plain']:.0f} s plain"
+        f"mean episode return over {record['seeds']} seeds (range; 'apart' where it does not meet"
+        f" that of the plain form); {record['task']}, preset {record['preset']},"
+        f" {record['env_steps']:,} transitions and {record['critic_updates']:,} critic updates of"
+        f" every seed; took: {walls}"
     )
-    return Sheet("Both forms of the learner", ("quarter", "fast", "plain", "overlap"), rows, note)
+    return Sheet("Forms of the learner", ("quarter", *forms), rows, note)
 
 
 SHEETS: dict[str, Callable[[Record], Sheet]] = {

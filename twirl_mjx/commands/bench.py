@@ -31,7 +31,7 @@ parts:
   worlds   control steps per second, beside the bare physics
   startup  seconds from the shell to the first critic updates
   epoch    where the time of a training epoch goes, and peak memory
-  forms    learning curves with the fast and the plain form of the learner (minutes; not in `all`)
+  forms    learning curves with every form of the learner (minutes; not in `all`)
   all      everything, into runs/bench.json and docs/performance.md (default)
 
 `twirl bench PART --help` lists the options of a part; `--json` prints one JSON document on stdout.
