@@ -180,7 +180,9 @@ def make_bounds(options: LearnerBench) -> dict[matmuls.Layout, tuple[Chain, int]
     Raises:
         jax.errors.JaxRuntimeError: None runs.
     """
-    bounds = {layout: make_bound(options, layout) for layout in matmuls.LAYOUTS}
+    bounds: dict[matmuls.Layout, tuple[Chain, int]] = {
+        layout: make_bound(options, layout) for layout in matmuls.LAYOUTS
+    }
     refusals = []
     for layout, (chain, _) in list(bounds.items()):
         try:
