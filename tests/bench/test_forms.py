@@ -36,6 +36,13 @@ def test_too_short_runs_and_single_seeds_are_refused() -> None:
         FormsBench(seeds=1)
 
 
+def test_unknown_forms_and_none_are_refused() -> None:
+    with pytest.raises(ValueError, match="bfloat16"):
+        FormsBench(forms=("bfloat8",))
+    with pytest.raises(ValueError, match="forms is empty, expected some of fast, bfloat16"):
+        FormsBench(forms=())
+
+
 def test_sheet_shows_means_and_ranges() -> None:
     quarter = {
         "plain": [4.0, 6.0], "fast": [1.0, 3.0], "overlap": {"plain": True, "fast": False},

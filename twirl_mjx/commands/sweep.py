@@ -15,10 +15,11 @@ from twirl_mjx.checks import check_range
 from twirl_mjx.commands.options import parse, say
 from twirl_mjx.sweep import estimate, gather, plan
 from twirl_mjx.sweep.grid import Grid, grids_folder, load
-from twirl_mjx.sweep.scheduler import Progress, RayExecutor, run_all, stop_on_signal
+from twirl_mjx.sweep.scheduler import Progress, RayExecutor, run_all
 from twirl_mjx.sweep.table import SweepView, plan_table
 from twirl_mjx.sweep.worker import Job
 from twirl_mjx.training.progress import format_seconds
+from twirl_mjx.training.signals import stop_on_signal
 
 
 @dataclasses.dataclass(frozen=True)

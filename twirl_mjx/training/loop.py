@@ -5,11 +5,9 @@ from __future__ import annotations
 import csv
 import dataclasses
 import math
-import signal
 import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +27,7 @@ from twirl_mjx.tasks.vector import VectorEnv
 from twirl_mjx.training import rundir, state
 from twirl_mjx.training.checkpoint import Checkpoints
 from twirl_mjx.training.metrics import RunLogger
+from twirl_mjx.training.signals import stop_on_signal
 from twirl_mjx.training.state import TrainState
 
 EVAL_CSV = "eval.csv"
@@ -50,27 +49,6 @@ class Outcome:
     env_steps: int
     final: dict[str, float]
     """Mean measures of the closing evaluation of the best policy; empty unless finished."""
-
-
-@contextmanager
-def stop_on_signal() -> Iterator[threading.Event]:
-    """Turn SIGTERM and Ctrl-C into an event; a second one interrupts at once."""
-    event = threading.Event()
-    if threading.current_thread() is not threading.main_thread():
-        yield event
-        return
-
-    def ask(number: int, frame: Any) -> None:
-        if event.is_set():
-            raise KeyboardInterrupt
-        event.set()
-
-    old = {s: signal.signal(s, ask) for s in (signal.SIGTERM, signal.SIGINT)}
-    try:
-        yield event
-    finally:
-        for number, handler in old.items():
-            signal.signal(number, handler)
 
 
 def act_mean(params: Any, memory: Any, env_state: Any, key: jax.Array) -> tuple[jax.Array, Any]:
