@@ -39,7 +39,7 @@ test-slow: setup ## the learning curves and other long tests
 train: setup ## train TASK= under SHIFT= with SEED= (ARGS="--preset debug --variant scratch")
 	$(TWIRL) train $(CASE) $(ARGS)
 
-evaluate: setup ## evaluate RUN=runs/NAME (several may be given)
+evaluate: setup ## evaluate RUN=runs/NAME (several may be given; ARGS="--shifts icy")
 	$(TWIRL) evaluate $(RUN) $(ARGS)
 
 collect: setup ## record a source policy in TASK= as a dataset
@@ -63,8 +63,8 @@ demo: setup ## render and evaluate the shipped policies; trains nothing
 bench: bench-setup ## measure this machine, beside SBX
 	$(TWIRL) bench $(ARGS)
 
-curriculum: setup ## train the chain of tasks one after another
-	$(TWIRL) curriculum $(CASE) $(ARGS)
+curriculum: setup ## train the chain of TASK= with SEED= (ARGS="--shifts": without the shifts)
+	$(TWIRL) curriculum $(if $(TASK),--task $(TASK)) $(if $(SEED),--seed $(SEED)) $(ARGS)
 
 clean: ## remove caches and build products (keeps .venv and runs/)
 	rm -rf build dist .pytest_cache .ruff_cache

@@ -18,10 +18,10 @@ GRID = (
 )
 
 SHORT = {
-    "total_env_steps": 102_400,
+    "total_env_steps": 99_200,
     "warmup_env_steps": 1600,
     "droq.target_entropy": -12.0,
-    "eval.every": 25_600,
+    "eval.every": 32_000,
     "eval.episodes": 16,
 }
 
@@ -36,4 +36,7 @@ REDUCED = (
     },
 )
 
-REDUCED_NOTE = "UTD 0.5 of 20, networks 2 x 128 of 2 x 256, 1 of 3 seeds, without plain twirl"
+REDUCED_NOTE = (
+    "99k of 100k transitions, UTD 0.5 of 20, target entropy -12 of -6, networks 2 x 128 of 2 x 256,"
+    " 1 of 3 seeds, without plain twirl"
+)

@@ -20,7 +20,7 @@ CELLS = {
     ("tasks", False): 2 * 2 * 3 + 2,
     ("tasks", True): 2 * 2 * 2 + 2,
     ("shifts", False): 2 * 5 * 4 * 3,
-    ("shifts", True): 2 * 5 * 3 * 2 + 2 * 5,
+    ("shifts", True): 2 * 5 * 3,
     ("phi", False): 2 * 5 * 4 * 3,
     ("phi", True): 4 * 2,
     ("utd", False): 2 * 5 * 4 * 3,
@@ -110,8 +110,9 @@ def test_reduced_form_is_smaller_and_says_so(name: str) -> None:
         config = draft.config
         assert config.total_env_steps % (config.steps_per_epoch * config.env.num_envs) == 0
     trained = [d for d in grid.drafts if d.config.variant != "zero-shot"]
+    fewest = 1 if name == "shifts" else 2  # its budget is nearly the paper's instead
     assert all(
-        len({d.config.seed for d in arm}) >= 2
+        len({d.config.seed for d in arm}) >= fewest
         for _, arm in itertools.groupby(trained, key=lambda d: d.arm)
     )
     assert "transitions" in grid.note

@@ -101,7 +101,7 @@ class StandConfig:
     """Task ``stand``: get up on the hind legs."""
 
     height_of: Literal["root", "front_feet"] = "root"
-    """Which height r_height rewards: the root's, or the mean of the front feet's (spec 5)."""
+    """Which height r_height rewards: the root's, or the mean of the front feet's (README, decision 7)."""
     risen_fraction: float = 0.0
     """Share of episodes started part-way up on the hind legs, at pitch U(0, 83 deg)."""
 
@@ -193,7 +193,7 @@ class EnvConfig:
     engine: Literal["auto", "mjx", "native"] = "auto"
     """Physics engine; auto is mjx on an accelerator and native (C MuJoCo threads) on a CPU."""
     course: Literal["auto", "random", "fixed"] = "auto"
-    """Goals and hurdles; auto is random without a shift and fixed under a shift (spec 6)."""
+    """Goals and hurdles; auto is random without a shift and fixed under a shift (README, decision 11)."""
 
     def __post_init__(self) -> None:
         """Check every number.

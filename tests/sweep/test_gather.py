@@ -100,6 +100,25 @@ def test_a_changed_grid_leaves_no_old_tables(
     assert names == {f"{a}{s}.csv" for a in arms for s in ("", ".episodes")} | {"mine.csv"}
 
 
+def test_tables_of_another_form_go_with_the_first_new_one(
+    plan_of: tuple[Grid, tuple[Cell, ...]], grid_file: Path, tmp_path: Path, finish_run: Finish
+) -> None:
+    grid, cells = plan_of
+    for cell in cells:
+        finish_run(cell, tmp_path / "runs")
+    gather(grid, cells, tmp_path / "runs", tmp_path / "results")
+    # Longer runs, of which one arm is finished: the others' tables are of the shorter ones.
+    grid_file.write_text(grid_file.read_text().replace("all of it", "half of it"))
+    grid = load(str(grid_file), reduced=True)
+    runs = tmp_path / "others"
+    cells = make_plan(grid, runs)
+    finish_run(next(c for c in cells if c.arm == "biped-phi0.5"), runs)
+    gather(grid, cells, runs, tmp_path / "results")
+    folder = tmp_path / "results" / "phi_reduced"
+    names = {p.name for p in folder.glob("*.csv")}
+    assert names == {"biped-phi0.5.csv", "biped-phi0.5.episodes.csv"}
+
+
 def test_a_changed_setting_does_not_reuse_old_runs(
     plan_of: tuple[Grid, tuple[Cell, ...]], grid_file: Path, tmp_path: Path, finish_run: Finish
 ) -> None:

@@ -21,7 +21,7 @@ CONFIG = TrainConfig(task="biped")
 
 
 def numpy_terms(qpos: np.ndarray, goal: np.ndarray, previous: float) -> dict[str, float]:
-    """Return the terms of spec section 5, from the pose alone."""
+    """Return the terms of the paper's appendix, from the pose alone."""
     matrix = Rotation.from_quat(qpos[3:7], scalar_first=True).as_matrix()
     way = goal - qpos[:2]
     distance = float(np.hypot(*way))

@@ -1,4 +1,4 @@
-"""What every registered task owes its callers (README, "Worlds")."""
+"""What every registered task owes its callers (README, "From Python")."""
 
 from __future__ import annotations
 

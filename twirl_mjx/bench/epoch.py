@@ -159,6 +159,9 @@ def _learner_parts(config: DroqConfig, state: TrainState) -> dict[str, Any]:
 def split(config: TrainConfig, rates: dict[str, float], epoch_s: float) -> Record:
     """Return the seconds that every part takes in one epoch.
 
+    ``environment`` and ``critic`` are differences of two measurements: noise may leave the smaller
+    one below zero.
+
     Args:
         config: The run.
         rates: Runs per second of the parts of ``make_parts``.
@@ -170,11 +173,11 @@ def split(config: TrainConfig, rates: dict[str, float], epoch_s: float) -> Recor
     actor = blocks / rates["actor"]
     seconds = {
         "physics": physics,
-        "environment": max(0.0, steps / rates["worlds"] - physics),
+        "environment": steps / rates["worlds"] - physics,
         "act": steps / rates["act"],
         "insert": steps / rates["insert"],
         "sample": blocks / rates["sample"],
-        "critic": max(0.0, blocks / rates["update"] - actor),
+        "critic": blocks / rates["update"] - actor,
         "actor": actor,
     }
     return {

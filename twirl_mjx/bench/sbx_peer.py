@@ -5,7 +5,7 @@ older jax than the package: nothing of ours is imported (``-P`` also keeps this 
 module path). Prints one JSON object on stdout.
 
 The configuration is the one SBX documents for DroQ (SAC with dropout, layer norm and a delayed
-policy), with the sizes of spec section 2. The replay is filled beforehand with random rows, so no
+policy), with the paper's sizes. The replay is filled beforehand with random rows, so no
 environment is stepped; sampling minibatches from the replay is part of what is timed, as it is
 part of every update that SBX makes.
 """

@@ -33,7 +33,8 @@ class EvaluateOptions:
     """Evaluate policies across dynamics conditions, on one fixed course unless told otherwise."""
 
     policies: Annotated[tuple[str, ...], tyro.conf.Positional]
-    """Run directories, policy files (.npz, .onnx) or scripted names (trot, bound, zero, random)."""
+    """Run directories, policy files (.npz, .onnx) or scripted names (trot, bound, zero,
+    random, clip)."""
     task: str | None = None
     """Task to act in; the one a policy was trained for by default."""
     shifts: tuple[str, ...] = SHIFTS

@@ -15,7 +15,10 @@ from twirl_mjx.presets import make_config
 
 @dataclasses.dataclass(frozen=True)
 class TrainOptions:
-    """Train a task, with every stage before it that is missing; the same command resumes."""
+    """Train a task (`collect`: only record its source), with every stage before it that is missing.
+
+    The same command resumes.
+    """
 
     preset: str
     """Settings to start from: paper, cpu or debug (default: cpu without an accelerator)."""

@@ -27,7 +27,7 @@ FALL_PARTS = {
     "biped": ("trunk", "head", "hip", "thigh"),
     "hurdles": ("trunk", "head"),
 }
-"""Parts of the robot whose ground contact ends an episode (spec section 5)."""
+"""Parts of the robot whose ground contact ends an episode (README, decisions 6 and 9)."""
 
 
 class Reading(NamedTuple):

@@ -60,7 +60,7 @@ class RehearsalConfig:
     """Distance of the biped's goal, m, in a random direction; ``None`` draws it as in training."""
     hurdle_gap: float | None = None
     """Distance between hurdles, m; ``None`` draws every gap from U(1.6, 2.6) m."""
-    height_of: Literal["root", "front_feet"] = "root"
+    height_of: Literal["root", "front_feet"] = "front_feet"
     """Height that ``stand`` rewards."""
 
     def __post_init__(self) -> None:

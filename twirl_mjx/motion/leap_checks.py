@@ -22,7 +22,7 @@ from twirl_mjx.sim import a1
 from twirl_mjx.sim.actuation import BUTTER_A, BUTTER_B
 
 BAND_LENGTH, BAND_HEIGHT = 0.2, 0.01
-"""m, hurdle band (spec section 5)."""
+"""m, hurdle band (paper appendix)."""
 CONTACT_HEIGHT = 2e-5
 """m, a foot lower than this stands."""
 MARGIN_CAP = 0.15

@@ -26,11 +26,11 @@ CONTROL_DT = 0.05
 HILL_START = 0.5
 """m, x at which the incline of a ``sloped`` scene begins; the robot starts at x = 0."""
 BUMP_CELL = 0.3
-"""m, edge of a heightfield tile (spec section 6)."""
+"""m, edge of a heightfield tile (docs/shifts.md)."""
 BUMP_HALF_SIZE = 30.0
 """m, half the edge of the square heightfield patch."""
 BUMP_HEIGHT = 0.05
-"""m, highest point of the heightfield at strength 1 (spec section 6)."""
+"""m, highest point of the heightfield at strength 1 (docs/shifts.md)."""
 MAX_BUMP_HEIGHT = 0.1
 """m, highest point at strength 2, which contact detection has to allow for."""
 BUMP_SEED = 7

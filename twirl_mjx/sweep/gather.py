@@ -26,7 +26,7 @@ Row = dict[str, str]
 
 
 def gather(grid: Grid, cells: Sequence[Cell], runs: Path, results: Path) -> list[Path]:
-    """Write the tables of every arm with a finished run; drop those of arms that are gone.
+    """Write the tables of every arm with a finished run; drop those of arms or forms that are gone.
 
     Args:
         grid: The grid.
@@ -46,7 +46,7 @@ def gather(grid: Grid, cells: Sequence[Cell], runs: Path, results: Path) -> list
         finished = [cell for cell in mine if is_finished(cell, runs)]
         if not finished:
             continue
-        notes = notes_of(grid, len(finished), len(mine))
+        notes = notes_of(grid, len(finished), len(mine)) + nominal_notes(finished)
         curves = [row for cell in finished for row in curve_rows(cell, runs, columns)]
         episodes = [row for cell in finished for row in episode_rows(cell, runs, columns)]
         for suffix, header, rows in (
@@ -70,15 +70,23 @@ def notes_of(grid: Grid, finished: int, expected: int) -> list[str]:
     return lines
 
 
+def nominal_notes(cells: Sequence[Cell]) -> list[str]:
+    """Return the comment line that names the runs whose skill was adapted; none without a shift."""
+    adapted = [Path(cell.source).name for cell in cells if cell.is_shifted]
+    return [f"# nominal: {', '.join(dict.fromkeys(adapted))}"] if adapted else []
+
+
 def stale_tables(folder: Path, grid: Grid, arms: set[str]) -> list[Path]:
-    """Return tables this grid has written for arms that it no longer has."""
-    mark = f"# grid: {grid.results_name}\n"
-    return [
-        path
-        for path in sorted(folder.glob("*.csv"))
-        if path.name.removesuffix(".csv").removesuffix(".episodes") not in arms
-        and mark in path.read_text(encoding="utf-8")[:2000]
-    ]
+    """Return tables this grid has written for arms, or in a form, that it no longer has."""
+    expected = set(notes_of(grid, 1, 1))
+    mark = f"# grid: {grid.results_name}"
+    stale = []
+    for path in sorted(folder.glob("*.csv")):
+        notes = path.read_text(encoding="utf-8")[:2000].splitlines()
+        arm = path.name.removesuffix(".csv").removesuffix(".episodes")
+        if mark in notes and (arm not in arms or not expected.issubset(notes)):
+            stale.append(path)
+    return stale
 
 
 def curve_rows(cell: Cell, runs: Path, columns: Sequence[str]) -> list[Row]:

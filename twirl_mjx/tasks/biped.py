@@ -2,7 +2,7 @@
 
 Observation [101]: ``observations.UPRIGHT``. Action [12] in [-1, 1]. Goal: uniform on a circle of
 radius ~ Exp(mean 1.5 m) clipped to [0.3, 5] m. Reward: r_stand (1 + r_facing + r_distance).
-Terminates when trunk, hip or thigh touches the ground (not the calf, spec section 5).
+Terminates when trunk, hip or thigh touches the ground (not the calf, README, decision 6).
 """
 
 from __future__ import annotations

@@ -42,7 +42,7 @@ WEIGHTS = {
 """Weights of the reward terms (paper Table 2); they sum to 1."""
 
 TARGET_STEPS = (1, 2, 7, 20)
-"""Control steps ahead of the target poses in the observation (spec section 5)."""
+"""Control steps ahead of the target poses in the observation (Peng et al. 2020)."""
 
 FLIGHT_STEPS = 4
 """Control steps in a row with all feet off the ground (at least 0.15 s) that make a flight."""

@@ -34,7 +34,7 @@ FRAME: tuple[Entry, ...] = (
     Entry("base_displacement_w", 3, "m"),
     Entry("previous_action", 12, "1"),
 )
-"""One step of the proprioceptive history (spec section 4)."""
+"""One step of the proprioceptive history (paper appendix; README, decisions 1 and 2)."""
 FRAME_SIZE = sum(e.size for e in FRAME)
 
 PROPRIOCEPTIVE: tuple[Entry, ...] = (

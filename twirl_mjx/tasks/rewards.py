@@ -1,4 +1,4 @@
-"""Reward terms: one pure function each, unweighted (paper appendix, spec section 5)."""
+"""Reward terms: one pure function each, unweighted (paper appendix)."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """From one command to a trained policy: source, collection, training; each stage resumes.
 
 ``train TASK`` = find or train the source policy -> collect its experience in the target task ->
-TWiRL. The variants are settings of the same program (spec section 1). Under a dynamics shift the
+TWiRL. The variants are settings of the same program (paper, section "Method"). Under a dynamics shift the
 source is a finished nominal run of the same task, and its replay is the source data.
 """
 
