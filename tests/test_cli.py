@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
 from twirl_mjx import cli
-from twirl_mjx.commands import options
+from twirl_mjx.commands import collect, demo, options, render
+from twirl_mjx.deploy.gl import RenderError
 from twirl_mjx.replay import dataset
+from twirl_mjx.training import pipeline
 
 
 def test_every_command_has_a_module_and_help(capsys: pytest.CaptureFixture[str]) -> None:
@@ -35,7 +40,11 @@ def test_unknown_command_suggests_the_nearest(capsys: pytest.CaptureFixture[str]
         (["train", "--task", "stand", "--preset", "debug", "--variant", "twirl"], "no source"),
         (["train", "--task", "biped", "--preset", "debug", "--source", "nowhere.npz"], "nowhere"),
         (["train", "--task", "biped", "--preset", "debug", "--shift", "icy"], "nominal run"),
+        (["collect", "--task", "stand", "--preset", "debug"], "nearest: --source trot"),
+        (["collect", "--task", "imitate", "--preset", "debug"], "nearest: --source clip"),
+        (["collect", "--task", "stand", "--preset", "debug", "--shift", "icy"], "nominal run"),
         (["render", "nowhere"], "no policy at nowhere"),
+        (["demo", "--seconds", "0", "--no-film"], "seconds = 0.0 is outside [0.1, 3600.0]"),
         (["evaluate", "trot"], "give --task"),
         (["evaluate", "trot", "--task", "biped", "--goal-distance", "0"], "nearest: 0.01"),
         (["evaluate", "trot", "--task", "hurdles", "--hurdle-gap", "1"], "nearest: 1.4"),
@@ -65,6 +74,104 @@ def test_bad_option_is_refused_with_the_nearest(
     printed = capsys.readouterr()
     words = " ".join((printed.err + printed.out).replace("│", " ").replace("|", " ").split())
     assert message in words
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "message"),
+    [
+        ("seconds", 0.0, r"seconds = 0\.0 is outside .*nearest: 0\.1"),
+        ("seconds", float("nan"), "seconds = nan"),
+        ("panels", 0, "panels = 0"),
+        ("shift", "icey", "nearest: 'icy'"),
+    ],
+)
+def test_films_that_cannot_be_made_are_refused(option: str, value: Any, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        render.RenderOptions("trot", **{option: value})
+    with pytest.raises(SystemExit) as error:
+        cli.main(["render", "trot", f"--{option}", str(value)])
+    assert error.value.code == 2
+
+
+@pytest.fixture
+def no_gl(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A machine on which nothing can be drawn, and a user who has not chosen a backend."""
+
+    def probe(environ: Any) -> str:
+        raise RenderError("cannot draw")
+
+    monkeypatch.setattr(cli, "probe_gl", probe)
+    monkeypatch.setenv("MUJOCO_GL", "any")  # so that the next line is undone at the end
+    monkeypatch.delenv("MUJOCO_GL")
+
+
+@pytest.mark.usefixtures("no_gl")
+@pytest.mark.parametrize(
+    "argv", [["render", "--help"], ["clip", "make", "--help"], ["demo", "--help"]]
+)
+def test_help_needs_no_opengl(argv: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ending:
+        cli.main(argv)
+    assert ending.value.code == 0
+    assert "--" in capsys.readouterr().out
+
+
+@pytest.mark.usefixtures("no_gl")
+def test_opengl_is_looked_for_when_something_is_drawn(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shown: list[str] = []
+    monkeypatch.setattr(demo, "_show", lambda path, options: shown.append(path.stem))
+    for argv in (["demo"], ["render", "trot", "--task", "stand"], ["clip", "show"]):
+        assert cli.main(argv) == 1
+        assert "cannot draw" in capsys.readouterr().err
+    assert not shown
+    assert cli.main(["demo", "--no-film"]) == 0
+    assert "stand" in shown
+    assert os.environ["MUJOCO_GL"] == "disable"
+
+
+def test_commands_that_draw_import_mujoco_when_the_backend_is_chosen() -> None:
+    code = """
+import sys
+from twirl_mjx import cli
+for name in cli.DRAWING:
+    cli._import_command(name)
+assert not {"mujoco", "jax"} & set(sys.modules), sorted(sys.modules)
+"""
+    subprocess.run([sys.executable, "-c", code], timeout=250, check=True)
+
+
+@pytest.mark.parametrize(
+    ("run_dir", "existing", "collects", "message"),
+    [
+        (None, False, True, "done: "),
+        (None, True, True, "done: "),
+        (None, True, False, "source.npz already fits these settings"),
+        (Path("runs/nominal"), False, False, "the replay of runs/nominal is the source data"),
+    ],
+)
+def test_collect_says_what_happened(
+    run_dir: Path | None, existing: bool, collects: bool, message: str, tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    def source_data(config: Any, target: Path, source: Any, say: Any) -> None:
+        if collects:
+            (target / "partial").write_text("data")
+            (target / "partial").replace(target / "source.npz")
+
+    source = SimpleNamespace(identity={"origin": "x", "digest": "y"}, run_dir=run_dir)
+    monkeypatch.setattr(pipeline, "find_source", lambda *_: source)
+    monkeypatch.setattr(pipeline, "source_data", source_data)
+    words = ["--task", "biped", "--preset", "debug", "--shift", "icy", "--runs", str(tmp_path)]
+    path = tmp_path / "mine" / "source.npz"
+    if existing:
+        path.parent.mkdir()
+        path.write_text("data")
+    assert collect.main([*words, "--name", "mine"]) == 0
+    said = capsys.readouterr().out
+    assert message in said
+    assert ("done" in said) == collects == (path.exists() and "nothing" not in said)
 
 
 def test_whole_method_on_the_debug_preset(tmp_path: Path) -> None:

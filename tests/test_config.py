@@ -67,6 +67,8 @@ def test_names_of_shifts_agree_with_the_physics() -> None:
         (lambda: DroqConfig(hidden_sizes=()), "hidden_sizes"),
         (lambda: EnvConfig(num_envs=0), r"nearest: 1\)"),
         (lambda: TrainConfig(replay=ReplayConfig(capacity=8)), "capacity 8 is below"),
+        (lambda: TrainConfig(seed=-1), r"seed = -1 is outside \[0, 4294967295\] \(nearest: 0\)"),
+        (lambda: TrainConfig(seed=2**32), r"seed = 4294967296 .*nearest: 4294967295"),
     ],
 )
 def test_bad_values_are_refused_with_the_nearest_valid(build, message: str) -> None:
@@ -109,6 +111,43 @@ def test_json_with_an_unknown_key_is_refused() -> None:
     record["droq"]["dicount"] = 0.9
     with pytest.raises(ValueError, match="nearest: 'discount'"):
         config_json.from_json(json.dumps(record))
+
+
+@pytest.mark.parametrize(
+    ("part", "field", "value", "message"),
+    [
+        ("", "total_env_steps", "1000", r"total_env_steps = '1000' is str, expected int .*1000"),
+        ("", "total_env_steps", 1000.5, r"1000.5 is float, expected int \(nearest: 1000\)"),
+        ("", "seed", True, "seed = True is bool, expected int"),
+        ("", "task", 5, "task = 5 is int, expected str"),
+        ("", "variant", 5, "variant = 5 is int, expected one of 'scratch', 'twirl'"),
+        ("", "droq", 5, "droq = 5 is int, expected DroqConfig"),
+        ("droq", "num_critics", 2.5, r"droq.num_critics = 2.5 is float, expected int .*nearest: 2"),
+        ("droq", "hidden_sizes", 256, r"256 is int, expected tuple\[int, ...\] .*\(256,\)"),
+        ("droq", "hidden_sizes", [256, 0.5], r"hidden_sizes = \(256, 0.5\) is tuple, expected"),
+        ("droq", "utd", "20", r"droq.utd = '20' is str, expected float \(nearest: 20.0\)"),
+        ("droq", "fast", 1, "droq.fast = 1 is int, expected bool"),
+        ("droq", "target_entropy", "low", r"target_entropy = 'low' is str, expected float \| None"),
+        ("env", "train_episode_length", 9.5, r"9.5 is float, expected int \| None .*nearest: 10"),
+        ("biped", "fixed_goal", [1.0, 0.0, 0.0], r"fixed_goal = .* expected tuple\[float, float\]"),
+    ],
+)
+def test_values_of_another_type_are_refused(
+    part: str, field: str, value: object, message: str
+) -> None:
+    record = json.loads(config_json.to_json(TrainConfig()))
+    (record[part] if part else record)[field] = value
+    with pytest.raises(ValueError, match=message):
+        config_json.from_json(json.dumps(record))
+
+
+def test_whole_numbers_stay_as_they_are_where_any_number_fits() -> None:
+    record = json.loads(config_json.to_json(TrainConfig()))
+    record["droq"] |= {"utd": 20, "target_entropy": -12}
+    droq = config_json.from_json(json.dumps(record)).droq
+    assert repr((droq.utd, droq.target_entropy)) == "(20, -12)"  # the digest of a run says so too
+    with pytest.raises(ValueError, match="expected names and values"):
+        config_json.from_json("[1]")
 
 
 def test_diff_names_every_field_that_differs() -> None:

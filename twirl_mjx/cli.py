@@ -9,6 +9,7 @@ import io
 import os
 import sys
 from pathlib import Path
+from typing import Any
 
 from twirl_mjx.deploy.gl import probe_gl
 
@@ -18,7 +19,7 @@ COMMANDS = {
     "evaluate": "evaluate policies across all six dynamics conditions",
     "render": "film a policy as mp4 and a strip of frames, headless",
     "export": "write a policy as an ONNX file",
-    "clip": "make, show or check a leap clip",
+    "clip": "make or show a leap clip",
     "sweep": "run what is missing of an experiment grid",
     "figures": "rebuild all figures from the committed tables",
     "report": "write the results as one HTML page",
@@ -29,7 +30,7 @@ COMMANDS = {
 }
 """Command name to its one-line description; each lives in ``twirl_mjx.commands.<name>``."""
 DRAWING = ("render", "demo", "clip")
-"""Commands that draw the robot."""
+"""Commands that may draw the robot; they say so to :func:`set_up` once they know."""
 
 
 def _usage() -> str:
@@ -41,8 +42,8 @@ def _usage() -> str:
     )
 
 
-def _set_environment(command: str) -> None:
-    """Choose the compilation cache and the GL backend before anything heavy is imported.
+def _set_environment() -> None:
+    """Choose the compilation cache before anything heavy is imported.
 
     ``TWIRL_CACHE_DIR`` places jax's persistent compilation cache (``~/.cache/twirl_mjx/jax`` by
     default); ``TWIRL_CACHE_DIR=off`` switches it off. Settings of jax itself win.
@@ -51,16 +52,32 @@ def _set_environment(command: str) -> None:
     if cache != "off":
         os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", cache)
         os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.5")
-    if "MUJOCO_GL" not in os.environ:
-        os.environ["MUJOCO_GL"] = probe_gl(os.environ) if command in DRAWING else "disable"
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # Ray would report to its makers
 
 
-def _import_command(name: str) -> object:
-    """Import a command; what libraries print while they are imported is kept off stdout."""
+def set_up(draws: bool) -> None:
+    """Choose the GL backend, which MuJoCo reads when it is imported, then import MuJoCo.
+
+    Args:
+        draws: Whether anything will be drawn; if not, no backend is looked for.
+
+    Raises:
+        RenderError: Something will be drawn and no backend works.
+    """
+    if "MUJOCO_GL" not in os.environ:
+        os.environ["MUJOCO_GL"] = probe_gl(os.environ) if draws else "disable"
+    _import_quietly("mujoco.mjx")
+
+
+def _import_command(name: str) -> Any:
+    return _import_quietly(f"twirl_mjx.commands.{name}")
+
+
+def _import_quietly(module: str) -> Any:
+    """Import a module; what libraries print while they are imported is kept off stdout."""
     with contextlib.redirect_stdout(io.StringIO()):
-        return importlib.import_module(f"twirl_mjx.commands.{name}")
+        return importlib.import_module(module)
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -81,9 +98,11 @@ def main(argv: list[str] | None = None) -> int:
         print(_usage(), end="", file=sys.stderr)
         return 2
     try:
-        _set_environment(name)
-        command = _import_command(name)
-        return command.main(rest)  # type: ignore[attr-defined]
+        _set_environment()
+        if name in DRAWING:  # these parse their options before they import the simulation
+            return _import_command(name).main(rest, set_up)
+        os.environ.setdefault("MUJOCO_GL", "disable")
+        return _import_command(name).main(rest)
     except (ValueError, FileNotFoundError) as error:
         print(f"twirl {name}: {error}", file=sys.stderr)
         return 2

@@ -101,7 +101,7 @@ class StandConfig:
     """Task ``stand``: get up on the hind legs."""
 
     height_of: Literal["root", "front_feet"] = "root"
-    """Which height r_height rewards: the root's, or the mean of the front feet's (README, decision 7)."""
+    """Which height r_height rewards: the root's or the front feet's mean (README, decision 7)."""
     risen_fraction: float = 0.0
     """Share of episodes started part-way up on the hind legs, at pitch U(0, 83 deg)."""
 
@@ -193,7 +193,7 @@ class EnvConfig:
     engine: Literal["auto", "mjx", "native"] = "auto"
     """Physics engine; auto is mjx on an accelerator and native (C MuJoCo threads) on a CPU."""
     course: Literal["auto", "random", "fixed"] = "auto"
-    """Goals and hurdles; auto is random without a shift and fixed under a shift (README, decision 11)."""
+    """Goals and hurdles; auto is random without a shift, fixed under one (README, decision 11)."""
 
     def __post_init__(self) -> None:
         """Check every number.
@@ -284,6 +284,7 @@ class TrainConfig:
         check_choice("shift", self.shift, SHIFTS)
         check_choice("variant", self.variant, VARIANTS)
         check_range("shift_strength", self.shift_strength, 0.0, 2.0)
+        check_range("seed", self.seed, 0, 2**32 - 1)  # 2**32 would be seed 0 again
         check_range("total_env_steps", self.total_env_steps, 1, 2**31 - 1)  # counted in int32
         check_range("warmup_env_steps", self.warmup_env_steps, 0, 10**12)
         check_range("epoch_env_steps", self.epoch_env_steps, 1, 10**9)
@@ -313,6 +314,11 @@ class TrainConfig:
     def uses_source_data(self) -> bool:
         """Whether minibatches hold source rows."""
         return self.variant in ("twirl", "twirl+weights") and self.effective_phi > 0.0
+
+    @property
+    def uses_source_weights(self) -> bool:
+        """Whether the networks begin as the source's."""
+        return self.variant in ("weights", "twirl+weights")
 
     @property
     def effective_phi(self) -> float:

@@ -3,9 +3,14 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
+import threading
+import time
 from pathlib import Path
 from typing import Any
 
+import psutil
 import pytest
 
 from twirl_mjx import cli
@@ -199,6 +204,75 @@ def test_part_that_fails_or_has_no_time_is_reported(monkeypatch: pytest.MonkeyPa
     assert "no time left" in bench.run_part("epoch", [], 0.0)["error"]
     monkeypatch.setattr(bench.sys, "executable", "false")
     assert bench.run_part("epoch", [], 60.0) == {"part": "epoch", "error": "ended with status 1"}
+
+
+def wait_for(path: Path) -> None:
+    deadline = time.monotonic() + 20.0
+    while not path.exists() and time.monotonic() < deadline:
+        time.sleep(0.01)
+
+
+def is_running(number: int) -> bool:
+    try:
+        return psutil.Process(number).status() != psutil.STATUS_ZOMBIE
+    except psutil.NoSuchProcess:
+        return False
+
+
+@pytest.fixture
+def child_of_part(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+    """A part that starts a process and waits; the file gets the number of that process."""
+    note = tmp_path / "child"
+    script = f"sleep 60 & echo $! > {note}.new; mv {note}.new {note}; wait"
+    monkeypatch.setattr(bench, "part_command", lambda name, arguments: ["sh", "-c", script])
+    return note
+
+
+def assert_ended(note: Path) -> None:
+    child = int(note.read_text())
+    deadline = time.monotonic() + 5.0
+    while is_running(child) and time.monotonic() < deadline:
+        time.sleep(0.01)
+    assert not is_running(child)
+
+
+def test_part_out_of_time_ends_with_its_children(child_of_part: Path) -> None:
+    assert "stopped after" in bench.run_part("startup", [], 0.5)["error"]
+    assert_ended(child_of_part)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_interrupted_part_ends_with_its_children(
+    child_of_part: Path, number: signal.Signals
+) -> None:
+    def interrupt() -> None:
+        wait_for(child_of_part)
+        os.kill(os.getpid(), number)
+
+    def ignore(number: int, frame: Any) -> None:
+        """Stand for what the process does otherwise, which would end the tests."""
+
+    before = signal.getsignal(number)
+    if number != signal.SIGINT:
+        signal.signal(number, ignore)
+    sender = threading.Thread(target=interrupt)
+    try:
+        sender.start()
+        with pytest.raises(KeyboardInterrupt):
+            bench.run_part("startup", [], 5.0)
+        assert signal.getsignal(number) in (before, ignore)
+    finally:
+        sender.join()
+        signal.signal(number, before)
+    assert_ended(child_of_part)
+
+
+def test_part_dies_with_the_command() -> None:
+    words = bench.part_command("epoch", ["--json"])
+    assert words[words.index(str(os.getpid())) :][2:] == [
+        bench.sys.executable, "-m", "twirl_mjx", "bench", "epoch", "--json",
+    ]  # fmt: skip
+    assert words[2].endswith("launch.py")
 
 
 def test_everything_is_written(

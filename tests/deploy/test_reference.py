@@ -131,3 +131,12 @@ def test_hurdles_reward_and_goal_by_hand() -> None:
     assert reward == pytest.approx(0.7 + 0.05 * np.exp(-np.pi / 3) + 0.15 * np.exp(-0.5) + 0.1)
     assert score.passed == 1
     np.testing.assert_array_equal(score.goal(np.ones(2)), [4.0, 0.0])
+
+
+def test_a_hurdle_stays_passed_when_the_robot_moves_back() -> None:
+    score = Score("hurdles", np.array([2.0, 4.0]))
+    for x in (2.41, 2.3):
+        reward = score.step(make_qpos(0, x=x), np.zeros(18), LIFTED, np.array([2.0, 0.0]))
+        assert reward == pytest.approx(0.2049 + 0.1)
+        assert score.passed == 1
+        np.testing.assert_array_equal(score.goal(np.ones(2)), [4.0, 0.0])

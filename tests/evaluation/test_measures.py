@@ -57,7 +57,7 @@ def test_biped_measures_by_hand() -> None:
             {"standing_time": [12.0, 12.0, 11.0], "min_distance": [0.14, 0.15, 0.1]},
             [True, False, False],
         ),
-        ("imitate", {"leaps": [2.0, 3.0]}, [False, True]),
+        ("imitate", {"flights": [2.0, 3.0]}, [False, True]),
         ("hurdles", {"hurdles_passed": [1.0, 2.0]}, [False, True]),
     ],
 )

@@ -33,6 +33,21 @@ def test_scenes_group_the_shifts() -> None:
     }  # fmt: skip
 
 
+def test_a_broken_step_is_no_measurement(config) -> None:
+    env = make_env(config, num_envs=2)
+
+    def act(params: Any, memory: Any, state: EnvState, key: jax.Array) -> tuple:
+        broken = (memory == 5) & (jnp.arange(2) == 0)
+        return jnp.where(broken[:, None], jnp.nan, jnp.zeros((2, 12))), memory + 1
+
+    values = make_evaluate(env, lambda state: jnp.zeros((), jnp.int32), act)(
+        None, jax.random.key(0)
+    )
+    assert values["invalid"].tolist() == [1.0, 0.0]
+    assert values["episode_length"].tolist() == [5.0, 12.0]
+    assert (values["min_distance"] > 0.1).all(), "metrics of a broken step are 0"
+
+
 def test_only_the_first_episode_counts() -> None:
     """Random actions end `stand` within a few steps; later episodes must leave no trace."""
     base = make_config("stand", "debug")

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import subprocess
 import sys
 from pathlib import Path
@@ -189,6 +190,13 @@ def test_other_format_version_is_refused(saved: Path) -> None:
     text = make_header().to_json().replace('"format_version": 1', '"format_version": 2')
     rewrite(saved, header=np.array(text))
     with pytest.raises(PolicyFileError, match=r"version 2 .* reads version 1"):
+        load_policy(saved)
+
+
+def test_card_that_is_no_object_is_refused(saved: Path) -> None:
+    text = json.dumps(json.loads(make_header().to_json()) | {"card": [1, 2]})
+    rewrite(saved, header=np.array(text))
+    with pytest.raises(PolicyFileError, match=r"\.npz: the card .* object, got \[1, 2\]"):
         load_policy(saved)
 
 

@@ -15,8 +15,8 @@ from twirl_mjx.assets import asset_path
 from twirl_mjx.config import ImitateConfig
 from twirl_mjx.droq import networks
 from twirl_mjx.motion.formats import read_clip, write_clip
-from twirl_mjx.policies.learned import PolicyHeader, load_policy, save_policy
-from twirl_mjx.policies.resolve import config_of_source, resolve_policy
+from twirl_mjx.policies.learned import PolicyFileError, PolicyHeader, load_policy, save_policy
+from twirl_mjx.policies.resolve import config_of_card, config_of_source, resolve_policy
 from twirl_mjx.policies.source import ObservingSource, OwnTaskSource
 from twirl_mjx.presets import make_config
 
@@ -57,6 +57,43 @@ def test_options_come_back_from_json_as_they_were(tmp_path: Path) -> None:
     assert own.task == "biped"
     assert own.biped.fixed_goal == (2.0, 1.0)
     hash(own)
+
+
+def test_card_gives_the_options_of_its_own_task(tmp_path: Path) -> None:
+    path = save(tmp_path / "stand.npz", "stand", 101, options={"height_of": "root"})
+    config = config_of_card(load_policy(path).header, str(path))
+    assert config == dataclasses.replace(
+        make_config("stand"),
+        stand=dataclasses.replace(make_config("stand").stand, height_of="root"),
+    )
+    assert make_config("stand").stand.height_of == "front_feet"
+    path = save(tmp_path / "old.npz", "stand", 101)  # cards did not always have options
+    assert config_of_card(load_policy(path).header, str(path)) == make_config("stand")
+
+
+@pytest.mark.parametrize(
+    ("task", "card", "message"),
+    [
+        ("crawl", {}, r"mine\.npz: unknown task 'crawl': choose one of .*nearest: "),
+        ("seed", {}, r"mine\.npz: unknown task 'seed'"),
+        ("stand", {"options": {"height_off": 1}}, r"mine\.npz: .*'height_off'.*'height_of'"),
+        (
+            "stand",
+            {"options": {"risen_fraction": 7}},
+            r"mine\.npz: .*risen_fraction = 7 is outside",
+        ),
+        ("stand", {"options": {"risen_fraction": "x"}}, r"mine\.npz: .*'risen_fraction': 'x'"),
+        ("stand", {"options": 3}, r"mine\.npz: the options on its card are 3"),
+    ],
+)
+def test_policies_of_another_version_are_refused(
+    task: str, card: dict, message: str, tmp_path: Path
+) -> None:
+    path = save(tmp_path / "mine.npz", task, 101, **card)
+    with pytest.raises(PolicyFileError, match=message):
+        resolve_policy(str(path), make_config("biped"))
+    with pytest.raises(PolicyFileError, match=message):
+        config_of_card(load_policy(path).header, str(path))
 
 
 def test_a_policy_of_another_size_is_refused(tmp_path: Path) -> None:

@@ -73,3 +73,23 @@ def test_missing_and_foreign_files(tmp_path: Path) -> None:
     path.write_bytes(b"not an archive")
     with pytest.raises(dataset.DatasetError, match="not a readable"):
         dataset.read(path, **SIZES)  # type: ignore[arg-type]
+    with path.open("wb") as file:
+        np.save(file, np.zeros(3))
+    with pytest.raises(dataset.DatasetError, match="one array, not an archive"):
+        dataset.read(path, **SIZES)  # type: ignore[arg-type]
+    with path.open("wb") as file:
+        np.savez(file, header=np.array("[1]"))
+    with pytest.raises(dataset.DatasetError, match=r"header is \[1\], not a JSON object"):
+        dataset.read(path, **SIZES)  # type: ignore[arg-type]
+
+
+def test_damaged_files(tmp_path: Path) -> None:
+    """Cut off while it was copied, and with a byte of the data changed."""
+    path = tmp_path / "source.npz"
+    dataset.write(path, make_header(), make_data())
+    whole = path.read_bytes()
+    at = whole.index(b"obs.npy") + 200
+    for damaged in (whole[: len(whole) // 2], whole[:at] + b"\xff\xff" + whole[at + 2 :]):
+        path.write_bytes(damaged)
+        with pytest.raises(dataset.DatasetError, match=r"source\.npz is not a readable.*collect"):
+            dataset.read(path, **SIZES)  # type: ignore[arg-type]

@@ -116,6 +116,9 @@ class HereExecutor:
     def stop(self, handle: Any) -> None:
         pass
 
+    def kill(self, handle: Any) -> None:
+        pass
+
 
 @pytest.fixture
 def here_executor() -> type[HereExecutor]:

@@ -2,21 +2,25 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import io
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 from rich.console import Console
 
 from twirl_mjx.commands import sweep
 from twirl_mjx.figures.tables import read_curves
-from twirl_mjx.sweep import estimate
+from twirl_mjx.sweep import estimate, scheduler
 from twirl_mjx.sweep.grid import load
 from twirl_mjx.sweep.plan import make_plan
 from twirl_mjx.sweep.scheduler import Progress
 from twirl_mjx.sweep.table import SweepView
+from twirl_mjx.sweep.worker import Ending
+from twirl_mjx.training import rundir
 
 Finish = Callable[..., Path]
 
@@ -31,13 +35,19 @@ def test_dry_run_lists_cells_with_status_and_time(
     grid_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], finish_run: Finish
 ) -> None:
     out = dry_run(capsys, grid_file)
-    for cell in ("first: stand s0", "biped-phi0.25 s0", "biped-phi0.5 s1", "biped-zs s0"):
+    for cell in (
+        "first: stand s0",
+        "first: stand s1",
+        "biped-phi0.25 s0",
+        "biped-phi0.5 s1",
+        "biped-zs s0",
+    ):
         assert cell in out
-    assert out.count("missing") == 6
-    assert "6 runs to do" in out
-    assert "6 default" in out
+    assert out.count("missing") == 7
+    assert "7 runs to do" in out
+    assert "7 default" in out
     cells = make_plan(load(str(grid_file)), tmp_path / "runs")
-    for cell in cells[:3]:
+    for cell in cells[:4]:
         finish_run(cell, tmp_path / "runs")
     out = dry_run(capsys, grid_file, "--workers", "2")
     assert "first: stand" not in out  # finished, and no cell of the grid
@@ -82,7 +92,7 @@ def test_estimates_use_what_was_measured(
     grid_file: Path, tmp_path: Path, finish_run: Finish
 ) -> None:
     runs = tmp_path / "runs"
-    _, cell, other, *_, zero_shot = make_plan(load(str(grid_file)), runs)
+    _, cell, _, other, *_, zero_shot = make_plan(load(str(grid_file)), runs)
     base = estimate.START_S + cell.config.replay.source_size / estimate.ENV_STEPS_PER_S
     steps, utd = cell.config.total_env_steps, cell.config.droq.utd
     default = estimate.estimate(cell, runs, estimate.measure(runs))
@@ -99,6 +109,69 @@ def test_estimates_use_what_was_measured(
         pytest.approx(expected), "scaled",
     )  # fmt: skip
     assert estimate.estimate(zero_shot, runs, []).seconds == estimate.START_S
+
+
+@pytest.mark.parametrize(
+    "cut",
+    [
+        "r,biped,none,twirl,0,updates_per_s,320,160",  # killed while writing
+        "r,biped,none,twirl,0,updates_per_s,320,160\n",
+        "r,biped,none,twirl,0,updates_per_s,320,160,1.0,9",  # perhaps of 9000
+        "r,biped,none,twirl,0,updates_per_s,320,160,1.0,9e\n",
+        "r,biped,none,twirl,0,updates_per_s,320,160r,biped,none,twirl,0,updates_per_s,320,160,1.0,9\n",
+    ],
+)
+def test_estimates_skip_rows_cut_off(
+    cut: str, grid_file: Path, tmp_path: Path, finish_run: Finish
+) -> None:
+    cell = make_plan(load(str(grid_file)), tmp_path)[1]
+    path = finish_run(cell, tmp_path) / "metrics.csv"
+    whole = estimate.measure(tmp_path)
+    with path.open("a") as file:
+        file.write(cut)
+    assert estimate.measure(tmp_path) == whole
+    path.write_text("\n".join(path.read_text().splitlines()[:1]) + "\n" + cut)
+    assert estimate.measure(tmp_path) == []
+
+
+def test_a_cell_of_another_sweep_is_left_to_it(
+    grid_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], finish_run: Finish,
+    here_executor: Any, monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    runs = tmp_path / "runs"
+    first, *others = make_plan(load(str(grid_file)), runs)
+    cells = {cell.name: cell for cell in (first, *others)}
+    other_sweep = contextlib.ExitStack()
+    other_sweep.enter_context(rundir.exclusive(runs / first.name))
+    started: list[str] = []
+
+    class Executor(here_executor):
+        def __init__(self, **_: object) -> None:
+            super().__init__(room=1)
+
+        def __enter__(self) -> Executor:
+            return self
+
+        def __exit__(self, *_: object) -> None:
+            pass
+
+        def ending(self, handle: Any) -> Ending:
+            started.append(handle[1].name)
+            finish_run(cells[handle[1].name], runs)
+            if len(started) == 2:  # the other sweep finishes its cell
+                finish_run(first, runs)
+                other_sweep.close()
+            return Ending(0, "here")
+
+    monkeypatch.setattr(sweep, "RayExecutor", Executor)
+    monkeypatch.setattr(scheduler, "BUSY_LOOK_S", 0.0)
+    argv = [str(grid_file), "--runs", str(runs), "--results", str(tmp_path / "results")]
+    assert sweep.main(argv) == 0
+    assert sorted(started) == sorted(cell.name for cell in others)
+    said = capsys.readouterr().out
+    assert "busy     first: stand s0 | in use by another process" in said
+    assert "done     first: stand s0" in said
+    assert "5 of 5 cells finished" in said
 
 
 def test_default_rates_by_width(grid_file: Path, tmp_path: Path) -> None:
@@ -138,6 +211,8 @@ def test_plain_lines_and_report(
     said = capsys.readouterr().out
     assert f"failed: {jobs[1].name}: exit status 1; log: {jobs[1].log}" in said
     assert "blocked" in said
+    third.state = "busy"  # a sweep that was stopped while it waited
+    assert sweep.report(table) == 130
     second.state = third.state = "stopped"
     assert sweep.report(table) == 130
     second.state = third.state = "done"
@@ -150,6 +225,8 @@ def test_the_live_table_shows_running_cells(grid_file: Path, tmp_path: Path) -> 
     times = {cell.name: estimate.Estimate(60.0, "default") for cell in cells}
     running = list(table.values())[1]
     running.state, running.attempts, running.began = "running", 2, 0.0
+    busy = list(table.values())[2]
+    busy.state, busy.reason = "busy", "in use by another process"
     out = io.StringIO()
     console = Console(file=out, width=200, force_terminal=True, legacy_windows=False)
     with SweepView(console, "phi", cells, tmp_path, times) as view:
@@ -157,7 +234,8 @@ def test_the_live_table_shows_running_cells(grid_file: Path, tmp_path: Path) -> 
     text = out.getvalue()
     assert "running (attempt 2)" in text
     assert "0 / 96 (0 %)" in text
-    assert "phi: 0 of 6 done" in text
+    assert "phi: 0 of 7 done" in text
+    assert "in use by another process" in text
 
 
 def test_a_job_is_the_command_a_user_could_type(grid_file: Path, tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from pathlib import Path
 
@@ -10,7 +11,7 @@ import pytest
 
 from twirl_mjx.figures.summary import main_metric, summarise
 from twirl_mjx.figures.tables import read_curves, read_directory, read_episodes
-from twirl_mjx.sweep.gather import gather, thin
+from twirl_mjx.sweep.gather import gather, nominal_notes, thin
 from twirl_mjx.sweep.grid import Grid, load
 from twirl_mjx.sweep.plan import Cell, make_plan
 
@@ -80,6 +81,33 @@ def test_missing_seeds_are_stated(
     written = gather(grid, cells, tmp_path / "runs", tmp_path / "results")
     assert [p.name for p in written] == ["biped-phi0.5.csv", "biped-phi0.5.episodes.csv"]
     assert "# incomplete: 1 of 2 seeds" in written[0].read_text().splitlines()
+
+
+def test_tables_of_adaptation_name_the_nominal_run(tmp_path: Path, finish_run: Finish) -> None:
+    path, runs, results = tmp_path / "shifts.py", tmp_path / "runs", tmp_path / "results"
+    axes = '{"task": {"biped": {"task": "biped"}}, "shift": {s: {"shift": s} for s in SHIFTS}}'
+    path.write_text(
+        'SHIFTS = ("none", "icy")\n'
+        f'GRID = ({{"preset": "debug", "seeds": (0, 1), "nominal": {{"seed": 0}},'
+        f' "axes": {axes}}},)'
+    )
+    grid = load(str(path))
+    cells = make_plan(grid, runs)
+    for cell in cells:
+        finish_run(cell, runs)
+    gather(grid, cells, runs, results)
+    nominal = next(c.name for c in cells if c.arm == "biped-none" and c.config.seed == 0)
+
+    def notes(name: str) -> list[str]:
+        lines = (results / "shifts" / name).read_text().splitlines()
+        return [line for line in lines if line.startswith("# nominal")]
+
+    for suffix in (".csv", ".episodes.csv"):
+        assert notes(f"biped-icy{suffix}") == [f"# nominal: {nominal}"]  # once for both seeds
+        assert notes(f"biped-none{suffix}") == []
+    adapted = [cell for cell in cells if cell.is_shifted]
+    others = [dataclasses.replace(adapted[0], source="/elsewhere/mine"), adapted[1]]
+    assert nominal_notes(others) == [f"# nominal: mine, {nominal}"]
 
 
 def test_a_changed_grid_leaves_no_old_tables(

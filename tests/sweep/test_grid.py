@@ -52,6 +52,13 @@ def test_settings_are_applied_at_once() -> None:
         (block(base={"repla.phi": 0.5}), r"config field 'repla'.*nearest: 'replay'"),
         (block(base={"replay.phi": 1.5}), r"replay.phi = 1.5 is outside \[0.0, 1.0\]"),
         (block(base={"droq.utd": 3.3}), "not a whole number of blocks"),
+        (
+            block(base={"total_env_steps": "1000"}),
+            r"here, arm biped: total_env_steps = '1000' is str, expected int \(nearest: 1000\)",
+        ),
+        (block(base={"droq.hidden_sizes": 256}), r"droq.hidden_sizes = 256 is int.*\(256,\)"),
+        (block(axes={"t": {"x": {"task": 5}}}), "arm x: task = 5 is int, expected str"),
+        (block(seeds=(2**32,)), r"seed = 4294967296 is outside \[0, 4294967295\]"),
     ],
 )
 def test_bad_blocks_are_refused(bad: dict[str, Any], message: str) -> None:

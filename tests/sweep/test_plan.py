@@ -5,10 +5,12 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 from pathlib import Path
+from typing import NamedTuple
 
 import pytest
 
-from twirl_mjx.commands.sweep import wanted
+from twirl_mjx.commands.sweep import main, wanted
+from twirl_mjx.config import TrainConfig
 from twirl_mjx.presets import make_config
 from twirl_mjx.sweep import plan
 from twirl_mjx.sweep.grid import Draft, load
@@ -32,7 +34,7 @@ def resolve(draft: Draft, runs: Path, nominal: list[Path] | None = None) -> dict
 
 def test_needed_runs_come_first(tmp_path: Path) -> None:
     stand, nominal, cell = resolve(adaptation(), tmp_path).values()
-    assert (stand.config.task, stand.config.seed, stand.arm) == ("stand", 0, "")
+    assert (stand.config.task, stand.config.seed, stand.arm) == ("stand", 3, "")
     assert (nominal.config.task, nominal.config.shift, nominal.config.seed) == ("biped", "none", 3)
     assert (nominal.config.variant, nominal.config.total_env_steps) == ("twirl", 64)
     assert (nominal.needs, cell.needs) == ((stand.name,), (nominal.name,))
@@ -41,8 +43,81 @@ def test_needed_runs_come_first(tmp_path: Path) -> None:
 
 def test_cells_share_the_runs_they_need(grid_file: Path, tmp_path: Path) -> None:
     cells = make_plan(load(str(grid_file)), tmp_path)
-    assert [c.config.task for c in cells if not c.arm] == ["stand"]
-    assert len(cells) == 5 + 1
+    first = [(c.config.task, c.config.seed) for c in cells if not c.arm]
+    assert first == [("stand", 0), ("stand", 1)]
+    assert len(cells) == 5 + 2
+
+
+def test_arms_with_equal_settings_are_refused(grid_file: Path, tmp_path: Path) -> None:
+    text = grid_file.read_text()
+    grid_file.write_text(
+        text.replace("for p in (0.25, 0.5)}", 'for p in (0.25, 0.5)} | {"own": {}}')
+    )
+    with pytest.raises(ValueError, match=r"'biped-phi0\.5' and 'biped-own' have equal settings"):
+        make_plan(load(str(grid_file)), tmp_path)
+    with pytest.raises(ValueError, match="'biped-own'"):  # also when only another arm is wanted
+        main([str(grid_file), "--runs", str(tmp_path), "--arms", "biped-zs", "--dry-run"])
+
+
+def test_a_cell_may_be_the_run_that_another_needs(grid_file: Path, tmp_path: Path) -> None:
+    axes = '{"shift": {s: {"shift": s} for s in ("none", "icy")}, "task": TASK}'
+    grid_file.write_text(
+        'TASK = {"b": {"task": "biped"}}\n'
+        f'GRID = ({{"preset": "debug", "seeds": (0,), "axes": {axes}}},)'
+    )
+    stand, nominal, icy = make_plan(load(str(grid_file)), tmp_path)
+    assert (stand.arm, nominal.arm, icy.arm) == ("", "none-b", "icy-b")
+    assert icy.needs == (nominal.name,)
+
+
+class TrainedError(Exception):
+    """Carries the config that the pipeline would train as the source."""
+
+
+@pytest.mark.parametrize("is_shipped", [False, True])
+@pytest.mark.parametrize("preset", ["debug", "cpu"])
+@pytest.mark.parametrize("source", ["auto", "train", "trot"])
+@pytest.mark.parametrize("options", [{}, {"clip": "own.npz"}])
+def test_sources_are_those_of_training(
+    options: dict[str, str], source: str, preset: str, is_shipped: bool,
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    from twirl_mjx.training import pipeline
+
+    file = tmp_path / "shipped.npz"
+    file.write_bytes(b"a policy")
+
+    def asset(*parts: str) -> Path:
+        if is_shipped:
+            return file
+        raise FileNotFoundError
+
+    def train(config: TrainConfig, *_: object) -> Path:
+        raise TrainedError(config)
+
+    monkeypatch.setattr(pipeline, "asset_path", asset)
+    monkeypatch.setattr(pipeline, "run", train)
+    monkeypatch.setattr(pipeline, "_from_path", lambda config, path: path)
+    monkeypatch.setattr(pipeline, "resolve_policy", lambda name, config: Named(None, name))
+    monkeypatch.setattr(plan, "_shipped", lambda task: file if is_shipped else None)
+    plain = make_config("hurdles", preset)
+    imitate = dataclasses.replace(plain.imitate, **options)
+    config = dataclasses.replace(plain, seed=2, source=source, imitate=imitate)
+    cells = list(resolve(Draft("arm", preset, config, ()), tmp_path).values())
+    try:
+        found = pipeline.find_source(config, preset, tmp_path, print)
+    except TrainedError as needed:
+        (expected,) = needed.args
+        assert cells[-1].needs == (cells[-2].name,)
+        assert dataclasses.replace(cells[-2].config, source=expected.source) == expected
+    else:
+        assert len(cells) == 1
+        assert cells[0].source == ("auto" if found == file else found.origin)
+
+
+class Named(NamedTuple):
+    policy: None
+    origin: str
 
 
 def test_scratch_and_scripted_need_nothing(tmp_path: Path) -> None:
@@ -100,6 +175,8 @@ def test_status(tmp_path: Path, finish_run: Finish) -> None:
     with rundir.exclusive(run_dir):
         assert status_of(cell, tmp_path) == "in use"
     finish_run(cell, tmp_path)
+    with rundir.exclusive(run_dir):
+        assert status_of(cell, tmp_path) == "in use"  # its last files are being written
     assert status_of(cell, tmp_path) == "finished"
     assert status_of(nominal, tmp_path) == "missing"
     assert status_of(stand, tmp_path) == "missing"

@@ -62,6 +62,23 @@ def test_crashes_and_lost_workers(tmp_path: Path) -> None:
         time.sleep(0.2)
 
 
+@pytest.mark.filterwarnings("default")  # Ray's own
+def test_ray_waits_for_a_run_that_saves_slowly(tmp_path: Path) -> None:
+    save_slowly = (
+        "import pathlib, signal, sys, time; p = pathlib.Path(sys.argv[1])\n"
+        "def save(*_): time.sleep(5); p.write_text('saved'); sys.exit(130)\n"
+        "signal.signal(signal.SIGTERM, save); p.write_text('up'); time.sleep(300)"
+    )
+    out, stop = tmp_path / "a.out", threading.Event()
+    with RayExecutor(address=None, workers=1, gpus=0.0) as executor:
+        table = run_all(
+            [make(tmp_path, "a", save_slowly)], executor, retries=1, stop=stop, poll_s=0.2,
+            show=lambda t: stop.set() if out.exists() else None,
+        )  # fmt: skip
+    assert (table["a"].state, table["a"].reason) == ("stopped", "exit status 130")
+    assert out.read_text() == "saved"
+
+
 def sweep(folder: Path) -> subprocess.Popen[str]:
     argv = [sys.executable, "-m", "twirl_mjx", "sweep", "utd.py", "--workers", "2"]
     argv += ["--runs", "runs", "--results", "results"]

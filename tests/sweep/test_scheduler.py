@@ -15,7 +15,8 @@ import pytest
 
 from twirl_mjx.sweep import scheduler
 from twirl_mjx.sweep.scheduler import Progress, run_all
-from twirl_mjx.sweep.worker import Job, claim_core, run_job
+from twirl_mjx.sweep.worker import BUSY, Job, claim_core, run_job
+from twirl_mjx.training import rundir
 
 WRITE = "import pathlib, sys; pathlib.Path(sys.argv[1]).write_text('done')"
 FAIL = "import sys; print('why it failed'); sys.exit(1)"
@@ -128,6 +129,80 @@ def test_nothing_starts_after_a_stop(tmp_path: Path, here_executor: Any) -> None
     table = run_all(jobs, executor, retries=1, stop=stop, show=stop_at_first)
     assert executor.submitted == ["a"]
     assert [table[n].state for n in "ab"] == ["done", "waiting"]
+
+
+BUSY_TRAIN = (
+    "import sys; from pathlib import Path; from twirl_mjx import cli\n"
+    "from twirl_mjx.training import rundir\n"
+    "class Train:\n"
+    "    def main(self, argv):\n"
+    "        with rundir.exclusive(Path(argv[0]), wait_s=0.0):\n"
+    "            return 0\n"
+    "cli._import_command = lambda name: Train()\n"
+    "sys.exit(cli.main(['train', sys.argv[1]]))"
+)
+
+
+def test_a_run_that_another_process_holds_is_told_from_a_crash(tmp_path: Path) -> None:
+    job = Job("a", ("-c", BUSY_TRAIN, str(tmp_path / "run")), str(tmp_path / "a.log"))
+    with rundir.exclusive(tmp_path / "run"):
+        assert run_job(job, pin=False).code == BUSY
+    assert run_job(job, pin=False).code == 0
+    # what an earlier attempt has said in the log is not what this one says
+    crash = Job("a", ("-S", "-c", FAIL), job.log)
+    assert run_job(crash, pin=False).code == 1
+
+
+@pytest.mark.parametrize("others_end", ["finished", "cut off"])
+def test_a_run_of_another_process_is_waited_for(
+    others_end: Any, tmp_path: Path, here_executor: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(scheduler, "BUSY_LOOK_S", 0.0)
+    looks = {"a": iter(["in use", "in use", others_end]), "b": iter(["missing"])}
+    jobs = [make(tmp_path, "a"), make(tmp_path, "b"), make(tmp_path, "c", needs=("a",))]
+    looks["c"] = iter(["missing"])
+    seen: list[str] = []
+    executor = here_executor(room=1)
+    table = run_all(
+        jobs, executor, retries=0, stop=threading.Event(), poll_s=0.01,
+        show=lambda t: seen.append(t["a"].state), look=lambda job: next(looks[job.name]),
+    )  # fmt: skip
+    assert {p.state for p in table.values()} == {"done"}
+    assert executor.submitted == ["b", "a", "c"] if others_end == "cut off" else ["b", "c"]
+    assert "busy" in seen
+    assert table["a"].attempts == (others_end == "cut off")
+
+
+def test_losing_the_race_for_a_run_is_no_attempt(
+    tmp_path: Path, here_executor: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(scheduler, "BUSY_LOOK_S", 0.0)
+    refused_twice = (
+        "import pathlib, sys; p = pathlib.Path(sys.argv[1])\n"
+        "tries = p.read_text() if p.exists() else ''; p.write_text(tries + 'x')\n"
+        "len(tries) < 2 and sys.exit('twirl train: runs/a is in use by process 1 on here')"
+    )
+    executor = here_executor()
+    jobs = [make(tmp_path, "a", refused_twice), make(tmp_path, "child", needs=("a",))]
+    table = run(jobs, executor, retries=0)
+    assert {name: (p.state, p.attempts) for name, p in table.items()} == {
+        "a": ("done", 1), "child": ("done", 1),
+    }  # fmt: skip
+    assert executor.submitted == ["a", "a", "a", "child"]
+
+
+def test_a_run_that_cannot_be_looked_at_is_one_failure(tmp_path: Path, here_executor: Any) -> None:
+    def look(job: Job) -> Any:
+        if job.name == "a":
+            raise ValueError("changed by hand")
+        return "missing"
+
+    table = run_all(
+        [make(tmp_path, "a"), make(tmp_path, "b")], here_executor(), retries=1,
+        stop=threading.Event(), show=lambda t: None, look=look,
+    )  # fmt: skip
+    assert (table["a"].state, table["a"].reason) == ("failed", "changed by hand")
+    assert table["b"].state == "done"
 
 
 def test_a_job_that_kills_itself_says_by_what(tmp_path: Path, here_executor: Any) -> None:

@@ -107,6 +107,17 @@ def test_stored_experience_and_networks_can_be_read_alone(
     jax.tree.map(np.testing.assert_array_equal, stored["critic"], final.learner.critic)
 
 
+def test_stored_experience_is_what_the_ring_still_holds(
+    stand_config: TrainConfig, tmp_path: Path
+) -> None:
+    small = dataclasses.replace(stand_config.replay, capacity=40)
+    config = dataclasses.replace(stand_config, replay=small, checkpoint_minutes=0.0)
+    loop.train(config, tmp_path / "small")  # a checkpoint every epoch: the log holds more rows
+    ring_rows = np.asarray(final_state(config, tmp_path / "small").replay.online.rows)
+    oldest = 96 % 40
+    np.testing.assert_array_equal(load_replay(tmp_path / "small"), np.roll(ring_rows, -oldest, 0))
+
+
 def test_finished_run_is_left_alone(stand_config: TrainConfig, whole_run: Path) -> None:
     before = (whole_run / "metrics.csv").read_bytes()
     assert loop.train(stand_config, whole_run).finished

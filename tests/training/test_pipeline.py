@@ -20,8 +20,8 @@ from twirl_mjx.policies.resolve import resolve_policy
 from twirl_mjx.presets import make_config
 from twirl_mjx.replay import dataset
 from twirl_mjx.tasks.registry import make_env
-from twirl_mjx.training import pipeline, rundir
-from twirl_mjx.training.checkpoint import load_replay
+from twirl_mjx.training import pipeline, rundir, weights
+from twirl_mjx.training.checkpoint import load_learner, load_replay
 from twirl_mjx.training.source import collect
 
 
@@ -85,15 +85,15 @@ def test_adaptation_starts_from_the_nominal_run(
 def test_source_networks_are_taken_over(biped: TrainConfig, runs: Path) -> None:
     config = dataclasses.replace(biped, shift="icy", variant="weights")
     source = pipeline.find_source(config, "debug", runs, print)
-    initial = pipeline.source_weights(config, source, print)
+    initial = weights.source_weights(config, source, print)
     fresh = droq.init(jax.random.key(7), config.droq, 101, 12)
     taken = initial(fresh)
-    policy = load_policy(runs / "biped-twirl-debug-s0")
+    best = load_policy(runs / "biped-twirl-debug-s0")
     obs = np.random.default_rng(0).normal(size=(3, 101)).astype(np.float32)
-    last = load_policy(runs / "biped-twirl-debug-s0" / "policy_last.npz")
     expected = droq.mean_action(taken.actor, jnp.asarray(obs))
-    np.testing.assert_allclose(last.act(obs), np.asarray(expected), atol=1e-6)
-    assert policy.observation_size == 101
+    np.testing.assert_allclose(best.act(obs), np.asarray(expected), atol=1e-6)
+    stored = load_learner(runs / "biped-twirl-debug-s0")
+    jax.tree.map(np.testing.assert_array_equal, taken.critic, stored["critic"])
     jax.tree.map(
         lambda a, b: (
             np.testing.assert_raises(AssertionError, np.testing.assert_array_equal, a, b)
@@ -109,7 +109,7 @@ def test_weights_refuse_sources_that_do_not_fit(biped: TrainConfig, runs: Path) 
     scripted = dataclasses.replace(biped, variant="weights", source="trot")
     source = pipeline.find_source(scripted, "debug", runs, print)
     with pytest.raises(ValueError, match="no network weights"):
-        pipeline.source_weights(scripted, source, print)
+        weights.source_weights(scripted, source, print)
     hurdles = dataclasses.replace(make_config("hurdles", "debug"), variant="weights")
     source = pipeline.find_source(
         dataclasses.replace(hurdles, source=str(runs / "biped-twirl-debug-s0")),
@@ -118,7 +118,7 @@ def test_weights_refuse_sources_that_do_not_fit(biped: TrainConfig, runs: Path) 
         print,
     )
     with pytest.raises(ValueError, match="observes as task biped"):
-        pipeline.source_weights(hurdles, source, print)
+        weights.source_weights(hurdles, source, print)
 
 
 def test_replay_of_the_nominal_run_is_the_source(runs: Path) -> None:
@@ -153,6 +153,76 @@ def test_another_source_is_refused_in_a_run_that_has_one(biped: TrainConfig, run
     with pytest.raises(rundir.RunMismatchError, match="source digest: 'trot' -> 'bound'"):
         pipeline.run(other, "debug", runs, None, print)
     assert before == {name: (run_dir / name).read_bytes() for name in before}
+
+
+def test_a_finished_run_is_left_as_it_is(biped: TrainConfig, runs: Path) -> None:
+    run_dir = runs / "biped-twirl-debug-s0"
+    (run_dir / "versions.json").write_text('{"commit": "of the training"}')
+    before = {path: path.read_bytes() for path in run_dir.iterdir() if path.is_file()}
+    said: list[str] = []
+    shorter = dataclasses.replace(biped, source="trot", total_env_steps=32)
+    assert pipeline.run(shorter, "debug", runs, None, said.append) == run_dir
+    assert f"{run_dir} is finished" in said
+    after = {path: path.read_bytes() for path in run_dir.iterdir() if path.is_file()}
+    assert before == after
+
+
+def test_weights_act_and_are_measured_from_the_first_step(biped: TrainConfig, runs: Path) -> None:
+    path = runs / "biped-twirl-debug-s0"
+    config = dataclasses.replace(
+        biped, variant="weights", source=str(path), warmup_env_steps=64, total_env_steps=32
+    )
+    run_dir = pipeline.run(config, "debug", runs, "warm", print)
+    with (run_dir / "metrics.csv").open(newline="") as file:
+        first = [row for row in csv.DictReader(file) if row["env_steps"] == "0"]
+    assert "eval/return" in {row["metric"] for row in first}
+    # Nothing was learned before the end of the warm-up: the actions are the source's, with noise.
+    taken = load_replay(run_dir)
+    obs, action = taken[:, :101], taken[:, 101:113]
+    mean = load_policy(path).act(obs)
+    draws = np.random.default_rng(0).uniform(-1.0, 1.0, (200, *action.shape))
+    chance = np.abs(draws - mean).mean(axis=(1, 2)).min()
+    assert np.abs(action - mean).mean() < chance
+
+
+def test_a_refused_run_leaves_its_name_free(biped: TrainConfig, runs: Path, tmp_path: Path) -> None:
+    path = str(runs / "biped-twirl-debug-s0")
+    wide = dataclasses.replace(biped.droq, num_critics=3)
+    config = dataclasses.replace(biped, variant="weights", source=path, droq=wide)
+    with pytest.raises(
+        ValueError, match=r"has 2 critics, this run 3 \(nearest: --droq.num-critics 2"
+    ):
+        pipeline.run(config, "debug", tmp_path, "name", print)
+    assert list(tmp_path.iterdir()) == []
+    # Killed before any work was done: only the description of the run is there.
+    rundir.open_run(tmp_path / "name", config)
+    rundir.open_run(tmp_path / "name", biped)
+    (tmp_path / "name" / "metrics.csv").touch()
+    with pytest.raises(rundir.RunMismatchError, match="num_critics: 2 -> 3"):
+        rundir.open_run(tmp_path / "name", config)
+
+
+def test_a_nominal_run_of_another_preset_is_not_taken(biped: TrainConfig, runs: Path) -> None:
+    cpu = dataclasses.replace(make_config("biped", "cpu"), shift="icy")
+    with pytest.raises(FileNotFoundError, match=r"finished in .*: .*biped-twirl-debug-s0"):
+        pipeline.find_source(cpu, "cpu", runs, print)
+
+
+def test_source_data_hold_whole_episodes(
+    biped: TrainConfig, runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    worlds: list[int] = []
+
+    def few(env, policy, key, size):  # type: ignore[no-untyped-def]
+        worlds.append(env.num_envs)
+        return collect(env, policy, key, size)
+
+    monkeypatch.setattr(pipeline, "collect", few)
+    crowd = dataclasses.replace(biped, env=dataclasses.replace(biped.env, num_envs=64))
+    config = dataclasses.replace(crowd, source="trot")
+    source = pipeline.find_source(config, "debug", runs, print)
+    pipeline.write_dataset(config, source, tmp_path / "source.npz", "digest", print)
+    assert worlds == [biped.replay.source_size // biped.env.episode_length]
 
 
 def test_the_engine_does_not_decide_what_is_collected(biped: TrainConfig, runs: Path) -> None:

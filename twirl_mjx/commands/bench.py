@@ -6,14 +6,18 @@ import contextlib
 import dataclasses
 import importlib
 import json
+import os
+import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 from twirl_mjx.checks import check_choice, check_range
 from twirl_mjx.commands.options import json_text, parse, say
+from twirl_mjx.sweep import launch
 
 PARTS = ("learner", "startup", "epoch", "worlds")
 """Worlds last: they leave out rows when the time is up."""
@@ -148,18 +152,65 @@ def part_arguments(name: str, options: AllBench) -> list[str]:
 def run_part(name: str, arguments: list[str], left: float) -> dict[str, Any]:
     """Run one part; its record, or ``{"part": ..., "error": ...}``.
 
+    However it ends, no process that it started goes on beside the next measurement.
+
     Args:
         name: Part.
         arguments: Its options.
         left: s, it is stopped after this time.
+
+    Raises:
+        KeyboardInterrupt: Interrupted, or asked to end by a signal.
     """
     if left <= 0:
         return {"part": name, "error": "no time left (--minutes)"}
-    command = [sys.executable, "-m", "twirl_mjx", "bench", name, *arguments]
+    with _signals_interrupt():
+        process = subprocess.Popen(
+            part_command(name, arguments),
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            start_new_session=True,
+        )
+        try:
+            output, _ = process.communicate(timeout=left)
+        except subprocess.TimeoutExpired:
+            return {"part": name, "error": f"stopped after {left:.0f} s (--minutes)"}
+        finally:
+            _end_group(process)
+    if process.returncode:
+        return {"part": name, "error": f"ended with status {process.returncode}"}
+    return json.loads(output)
+
+
+def part_command(name: str, arguments: list[str]) -> list[str]:
+    """Return the command line of a part that dies with this process."""
+    launcher = [sys.executable, "-S", launch.__file__, str(os.getpid()), "-"]
+    return [*launcher, sys.executable, "-m", "twirl_mjx", "bench", name, *arguments]
+
+
+def _end_group(process: subprocess.Popen[bytes]) -> None:
+    """Kill what is left of the group that a process leads, and reap the process."""
+    with contextlib.suppress(ProcessLookupError, PermissionError):  # nobody is left
+        os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
+    if process.stdout is not None:
+        process.stdout.close()
+
+
+@contextlib.contextmanager
+def _signals_interrupt() -> Iterator[None]:
+    """Let SIGTERM and SIGHUP raise ``KeyboardInterrupt``: they do not reach another session."""
+
+    def interrupt(number: int, frame: Any) -> None:
+        raise KeyboardInterrupt
+
+    found = {s: signal.getsignal(s) for s in (signal.SIGTERM, signal.SIGHUP)}
+    # What nohup ignores stays ignored; None is a handler that Python could not restore.
+    old = {s: kind for s, kind in found.items() if kind not in (signal.SIG_IGN, None)}
+    for number in old:
+        signal.signal(number, interrupt)
     try:
-        done = subprocess.run(command, stdout=subprocess.PIPE, timeout=left, check=False)
-    except subprocess.TimeoutExpired:
-        return {"part": name, "error": f"stopped after {left:.0f} s (--minutes)"}
-    if done.returncode:
-        return {"part": name, "error": f"ended with status {done.returncode}"}
-    return json.loads(done.stdout)
+        yield
+    finally:
+        for number, handler in old.items():
+            signal.signal(number, handler)

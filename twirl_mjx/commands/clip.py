@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
 
@@ -12,14 +13,7 @@ import tyro
 from twirl_mjx.assets import asset_path
 from twirl_mjx.checks import check_choice
 from twirl_mjx.commands.options import parse, say
-from twirl_mjx.deploy.render import render_episode
-from twirl_mjx.motion import show as show_lib
-from twirl_mjx.motion.clip import configurations
-from twirl_mjx.motion.formats import read_clip, write_clip
-from twirl_mjx.motion.leap import make_leap
-from twirl_mjx.motion.leap_checks import require_leap
 from twirl_mjx.motion.leap_config import LeapConfig
-from twirl_mjx.sim.scene import Bands, build_scene
 
 FRAME_DT = 0.025
 """s between the frames of a film, half speed at 20 frames per second."""
@@ -49,18 +43,28 @@ class ShowOptions:
     """Where the other clips come from, written into the comparison."""
 
 
-def main(argv: list[str]) -> int:
-    """Run ``make`` or ``show``."""
+def main(argv: list[str], set_up: Callable[[bool], None]) -> int:
+    """Run ``make`` or ``show``.
+
+    Args:
+        argv: What to do, and its options.
+        set_up: Gets whether the robot is drawn, before the simulation is imported.
+    """
     verb, rest = (argv[0], argv[1:]) if argv else ("", [])
     if verb in ("-h", "--help", ""):
         say("usage: twirl clip {make,show} [options]; `twirl clip make --help` lists them")
         return 0 if verb else 2
     check_choice("clip action", verb, ("make", "show"))
-    return _make(rest) if verb == "make" else _show(rest)
+    return _make(rest, set_up) if verb == "make" else _show(rest, set_up)
 
 
-def _make(argv: list[str]) -> int:
+def _make(argv: list[str], set_up: Callable[[bool], None]) -> int:
     options = parse(MakeOptions, argv, "twirl clip make")
+    set_up(False)
+    from twirl_mjx.motion.formats import write_clip
+    from twirl_mjx.motion.leap import make_leap
+    from twirl_mjx.motion.leap_checks import require_leap
+
     clip = make_leap(options.leap, say)
     for finding in require_leap(clip):
         say(str(finding))
@@ -69,8 +73,15 @@ def _make(argv: list[str]) -> int:
     return 0
 
 
-def _show(argv: list[str]) -> int:
+def _show(argv: list[str], set_up: Callable[[bool], None]) -> int:
     options = parse(ShowOptions, argv, "twirl clip show")
+    set_up(True)
+    from twirl_mjx.deploy.render import render_episode
+    from twirl_mjx.motion import show as show_lib
+    from twirl_mjx.motion.clip import configurations
+    from twirl_mjx.motion.formats import read_clip
+    from twirl_mjx.sim.scene import Bands, build_scene
+
     clips = [read_clip(path) for path in options.clips or (asset_path("a1", "leap.json"),)]
     options.out.parent.mkdir(parents=True, exist_ok=True)
     stem = options.out.parent / options.out.name

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 from twirl_mjx.commands.options import parse_train, say
+from twirl_mjx.config import SCRIPTED_SOURCES, SOURCE_OF, TrainConfig
+from twirl_mjx.presets import starts_from_nominal_run
 from twirl_mjx.training import pipeline, rundir
 
 
@@ -10,10 +14,47 @@ def main(argv: list[str]) -> int:
     """Record a source policy in a target task as ``runs/<name>/source.npz``."""
     options = parse_train(argv, "twirl collect")
     config = options.config
+    check_source(config, options.preset)
     source = pipeline.find_source(config, options.preset, options.runs, say)
     run_dir = options.runs / (options.name or rundir.default_name(config, options.preset))
     with rundir.exclusive(run_dir):
         rundir.open_run(run_dir, config, source.identity)
+        path = run_dir / "source.npz"
+        before = _version(path)
         pipeline.source_data(config, run_dir, source, say)
-    say(f"done: {run_dir / 'source.npz'}")
+        written = _version(path) != before
+    if written:
+        say(f"done: {path}")
+    elif config.shift != "none" and source.run_dir is not None:
+        say(
+            f"nothing was collected: under shift {config.shift} the replay of {source.run_dir} is"
+            " the source data, and `twirl train` reads it there"
+        )
+    else:
+        say(f"nothing was collected: {path} already fits these settings")
     return 0
+
+
+def check_source(config: TrainConfig, preset: str) -> None:
+    """Refuse a task that has no source policy unless one is named.
+
+    Raises:
+        ValueError: There is nothing to record; the message lists what can be named.
+    """
+    named = config.source not in ("auto", "train")
+    if named or config.task in SOURCE_OF or starts_from_nominal_run(config, preset):
+        return
+    nearest = "clip" if config.task == "imitate" else "trot"
+    raise ValueError(
+        f"task {config.task} has no source policy of its own, so --source {config.source} finds"
+        f" nothing to record: name one of {', '.join(SCRIPTED_SOURCES)}, a run directory or a"
+        f" policy file (nearest: --source {nearest})"
+    )
+
+
+def _version(path: Path) -> tuple[int, int] | None:
+    """Return what changes when a file is replaced; None if there is none."""
+    if not path.exists():
+        return None
+    status = path.stat()
+    return status.st_ino, status.st_mtime_ns

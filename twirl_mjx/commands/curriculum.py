@@ -14,7 +14,6 @@ from twirl_mjx.config import SHIFTS, TrainConfig
 from twirl_mjx.presets import PRESETS
 from twirl_mjx.sweep.grid import configure
 from twirl_mjx.training import pipeline, rundir
-from twirl_mjx.training.loop import EVAL_CSV
 
 ADAPTATION_ENV_STEPS = 100_000
 """Transitions of an adaptation run (paper, section "Transfer to New Environments")."""
@@ -104,9 +103,6 @@ def main(argv: list[str]) -> int:
         check_choice("shift", shift, SHIFTS[1:])
     links = plan(options, preset)
     for number, (name, config) in enumerate(links, 1):
-        if (options.runs / name / EVAL_CSV).is_file():
-            say(f"link {number} of {len(links)}: {name} is finished")
-            continue
         say(f"link {number} of {len(links)}: {name}")
         pipeline.run(config, preset, options.runs, name, say)
     return 0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -11,12 +12,8 @@ import numpy as np
 from twirl_mjx.assets import asset_path
 from twirl_mjx.checks import check_range
 from twirl_mjx.commands.options import parse, say
-from twirl_mjx.commands.render import RenderOptions, film
+from twirl_mjx.commands.render import FILM_SECONDS, RenderOptions, config_of, film
 from twirl_mjx.config import TASKS
-from twirl_mjx.evaluation.rollout import make_evaluate
-from twirl_mjx.policies.resolve import resolve_policy
-from twirl_mjx.presets import make_config
-from twirl_mjx.tasks.registry import make_env
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,14 +32,21 @@ class DemoOptions:
     """Longest film."""
 
 
-def main(argv: list[str]) -> int:
-    """Show every policy in ``assets/policies``."""
+def main(argv: list[str], set_up: Callable[[bool], None]) -> int:
+    """Show every policy in ``assets/policies``.
+
+    Args:
+        argv: Options.
+        set_up: Gets whether anything is drawn, before the simulation is imported.
+    """
     options = parse(DemoOptions, argv, "twirl demo")
     check_range("episodes", options.episodes, 1, 100_000)
+    check_range("seconds", options.seconds, *FILM_SECONDS)
     folder = asset_path("policies")
     found = [folder / f"{task}.npz" for task in TASKS if (folder / f"{task}.npz").is_file()]
     if not found:
         raise FileNotFoundError(f"no policy in {folder}: train one with `twirl train`")
+    set_up(options.film)
     for path in found:
         _show(path, options)
     return 0
@@ -51,8 +55,12 @@ def main(argv: list[str]) -> int:
 def _show(path: Path, options: DemoOptions) -> None:
     import jax
 
+    from twirl_mjx.evaluation.rollout import make_evaluate
+    from twirl_mjx.policies.resolve import resolve_policy
+    from twirl_mjx.tasks.registry import make_env
+
     began = time.monotonic()
-    config = make_config(path.stem)
+    config = config_of(str(path), None)
     policy = resolve_policy(str(path), config).policy
 
     def act(params: object, memory: object, state: object, key: jax.Array) -> tuple:

@@ -16,11 +16,11 @@ from rich.table import Table
 
 from twirl_mjx.checks import check_choice, check_range
 from twirl_mjx.commands.options import parse, say
-from twirl_mjx.commands.render import config_of
+from twirl_mjx.commands.render import config_of, name_of
 from twirl_mjx.config import SHIFTS, TrainConfig
 from twirl_mjx.evaluation.shifts import evaluate_shifts
 from twirl_mjx.figures.statistics import bootstrap
-from twirl_mjx.policies.resolve import resolve_policy
+from twirl_mjx.policies.resolve import ResolvedPolicy, resolve_policy
 from twirl_mjx.tasks.bands import MIN_GAP
 from twirl_mjx.training.loop import EVAL_COLUMNS
 
@@ -54,9 +54,23 @@ class EvaluateOptions:
     seed: int = 2_000_003
     """Seed of the episodes; training never uses it."""
     out: Path = Path("runs/evaluation.csv")
-    """Tidy table of every episode, replaced if it exists."""
+    """Tidy table of every episode, replaced after every policy."""
     figure: Path | None = None
     """Also draw the returns as bars into this PNG file."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Candidate:
+    """A policy to evaluate."""
+
+    given: str
+    """What the command line calls it."""
+    run: str
+    """What the table calls it."""
+    config: TrainConfig
+    """Task, course and options it is scored under."""
+    found: ResolvedPolicy
+    """The policy."""
 
 
 def main(argv: list[str]) -> int:
@@ -67,16 +81,45 @@ def main(argv: list[str]) -> int:
     check_range("episodes", options.episodes, 1, 1_000_000)
     for shift in options.shifts:
         check_choice("shift", shift, SHIFTS)
+    candidates = resolve_all(options)
     rows: list[list[object]] = []
-    for name in options.policies:
-        rows += _evaluate_one(name, options)
-    options.out.parent.mkdir(parents=True, exist_ok=True)
-    with options.out.open("w", newline="") as file:
-        csv.writer(file, lineterminator="\n").writerows([EVAL_COLUMNS, *rows])
-    say(f"wrote {options.out}: {len(rows):,} rows")
+    for candidate in candidates:
+        rows += _evaluate_one(candidate, options)
+        write_rows(options.out, rows)
+        say(f"wrote {options.out}: {len(rows):,} rows")
     if options.figure is not None:
         _draw(options.out, options.figure)
     return 0
+
+
+def resolve_all(options: EvaluateOptions) -> list[Candidate]:
+    """Return all policies, ready to act, before the first of them is evaluated.
+
+    Raises:
+        FileNotFoundError: Nothing to load under a name.
+        ValueError: A file that is no policy, a course of another task, or two policies that the
+            table could not tell apart.
+    """
+    candidates: dict[str, Candidate] = {}
+    for given in options.policies:
+        run = name_of(given)
+        if run in candidates:
+            raise ValueError(
+                f"{candidates[run].given} and {given} would both be {run!r} in {options.out}:"
+                " evaluate them one by one with --out, or copy one to another name"
+            )
+        config = on_course(config_of(given, options.task), options)
+        candidates[run] = Candidate(given, run, config, resolve_policy(given, config))
+    return list(candidates.values())
+
+
+def write_rows(path: Path, rows: list[list[object]]) -> None:
+    """Write a table of episodes under its header, whole or not at all."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(path.name + ".partial")
+    with partial.open("w", newline="") as file:
+        csv.writer(file, lineterminator="\n").writerows([EVAL_COLUMNS, *rows])
+    partial.replace(path)
 
 
 def on_course(config: TrainConfig, options: EvaluateOptions) -> TrainConfig:
@@ -101,10 +144,9 @@ def on_course(config: TrainConfig, options: EvaluateOptions) -> TrainConfig:
     return dataclasses.replace(config, biped=biped, hurdles=hurdles, env=env)
 
 
-def _evaluate_one(name: str, options: EvaluateOptions) -> list[list[object]]:
-    path = Path(name)
-    config = on_course(config_of(name, options.task), options)
-    found = resolve_policy(name, config)
+def _evaluate_one(candidate: Candidate, options: EvaluateOptions) -> list[list[object]]:
+    """Evaluate one policy and print its table; return its rows."""
+    config, found = candidate.config, candidate.found
     began = time.monotonic()
     values = evaluate_shifts(
         config,
@@ -115,15 +157,14 @@ def _evaluate_one(name: str, options: EvaluateOptions) -> list[list[object]]:
         strength=options.strength,
     )
     wall = time.monotonic() - began
-    _print_table(f"{name} in {config.task}", values)
+    _print_table(f"{candidate.given} in {config.task}", values)
     conditions = len(options.shifts)
     say(f"{conditions} conditions x {options.episodes} episodes in {wall:.1f} s, with compilation")
     card = getattr(getattr(found.loaded, "header", None), "card", {})
-    identity = [path.stem if path.suffix else path.name or name, config.task]
-    steps = card.get("env_steps", 0)
     variant = card.get("variant", "scripted") if found.loaded else "scripted"
+    trained = [variant, card.get("seed", config.seed), card.get("env_steps", 0)]
     return [
-        [*identity, shift, variant, config.seed, steps, episode, measure, f"{float(value):.9g}"]
+        [candidate.run, config.task, shift, *trained, episode, measure, f"{float(value):.9g}"]
         for shift, measures in values.items()
         for measure, column in measures.items()
         for episode, value in enumerate(column)

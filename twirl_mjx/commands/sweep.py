@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from fnmatch import fnmatch
 from pathlib import Path
 from typing import Annotated
@@ -65,6 +65,7 @@ def main(argv: list[str]) -> int:
         load(options.grid, reduced=options.reduced, seeds=options.seeds or None), options.arms
     )
     runs = options.runs.resolve()
+    plan.make_plan(joined(whole, grid), runs, options.nominal)  # refused now, not when gathered
     cells = plan.make_plan(grid, runs, options.nominal)
     status: dict[str, plan.Status] = {cell.name: plan.status_of(cell, runs) for cell in cells}
     todo = wanted(cells, status)
@@ -174,7 +175,21 @@ def _run(
             address=options.address, workers=options.workers, gpus=options.gpus
         ) as executor,
     ):
-        return run_all(jobs, executor, retries=options.retries, stop=stop, show=view.update)
+        return run_all(
+            jobs,
+            executor,
+            retries=options.retries,
+            stop=stop,
+            show=view.update,
+            look=look_of(todo, runs),
+            say=view.say,
+        )
+
+
+def look_of(cells: Sequence[plan.Cell], runs: Path) -> Callable[[Job], plan.Status]:
+    """Return a function that looks at how far the run of a job is, whoever works on it."""
+    by_name = {cell.name: cell for cell in cells}
+    return lambda job: plan.status_of(by_name[job.name], runs)
 
 
 def job_of(cell: plan.Cell, runs: Path) -> Job:
@@ -186,7 +201,7 @@ def job_of(cell: plan.Cell, runs: Path) -> Job:
 def report(table: Mapping[str, Progress]) -> int:
     """Say what did not finish and where its output is; return the exit status."""
     lost = [p for p in table.values() if p.state in ("failed", "blocked")]
-    stopped = [p for p in table.values() if p.state in ("stopped", "waiting", "running")]
+    stopped = [p for p in table.values() if p.state in ("stopped", "waiting", "running", "busy")]
     for progress in lost:
         say(f"{progress.state}: {progress.job.name}: {progress.reason}; log: {progress.job.log}")
     if stopped:

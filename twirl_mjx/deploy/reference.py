@@ -104,7 +104,7 @@ class Score:
     standing_steps: int = 0
     """Control steps upright with both front feet lifted."""
     passed: int = 0
-    """Hurdles passed."""
+    """Hurdles passed so far; one that the robot moves back over stays passed."""
     min_distance: float = np.inf
     """Smallest planar distance to the goal so far, m."""
     previous_distance: float = np.inf
@@ -161,7 +161,7 @@ class Score:
 
     def _hurdles(self, qpos: np.ndarray, qvel: np.ndarray) -> float:
         """Return the hurdles reward and count the hurdles passed."""
-        self.passed = int(np.sum(qpos[0] > self.hurdles + PASSED))
+        self.passed = max(self.passed, int(np.sum(qpos[0] > self.hurdles + PASSED)))
         angle = 2.0 * np.arccos(min(abs(qpos[3]), 1.0))
         forward = 1.0 if qvel[0] > 0.5 else 0.007
         calm = np.exp(-0.1 * np.linalg.norm(qvel[6:]))

@@ -52,7 +52,7 @@ MEASURES: dict[str, dict[str, Measure]] = {
     "imitate": COMMON
     | {
         "tracking": Measure("tracking", "mean", 1.0, "1", "mean reward over its maximum"),
-        "leaps": Measure("leaps", "max", 1.0, "1", "leap cycles completed"),
+        "leaps": Measure("leaps", "max", 1.0, "1", "cycles of the clip survived"),
         "flights": Measure("flights", "max", 1.0, "1", "cycles with a flight of 4 steps or more"),
     },
     "hurdles": COMMON
@@ -81,7 +81,7 @@ def success(task: str, values: dict[str, jax.Array]) -> jax.Array:
     """Return which episodes succeeded, given their measures (arrays of one shape).
 
     stand: standing time >= 12 s. biped: minimum distance <= 0.14 m and standing time >= 12 s.
-    imitate: >= 3 leaps. hurdles: >= 2 hurdles passed.
+    imitate: >= 3 cycles with a flight. hurdles: >= 2 hurdles passed.
     """
     if task == "stand":
         return values["standing_time"] >= STANDING_SUCCESS_S
@@ -89,7 +89,7 @@ def success(task: str, values: dict[str, jax.Array]) -> jax.Array:
         near = values["min_distance"] <= GOAL_SUCCESS_M
         return near & (values["standing_time"] >= STANDING_SUCCESS_S)
     if task == "imitate":
-        return values["leaps"] >= LEAPS_SUCCESS
+        return values["flights"] >= LEAPS_SUCCESS
     return values["hurdles_passed"] >= HURDLES_SUCCESS
 
 

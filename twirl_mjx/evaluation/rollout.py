@@ -39,8 +39,9 @@ def first_episodes(
         index: [N] number of every episode; equal numbers start alike. 0 to N - 1 by default.
 
     Returns:
-        Every measure of the task and ``success``, each [N]; steps after the first end of a world
-        do not count. ``invalid`` is 1 where the episode was cut short by a non-finite state.
+        Every measure of the task and ``success``, each [N]; steps after the first end of a world,
+        and one with a non-finite state, do not count. ``invalid`` is 1 where the episode was cut
+        short by a non-finite state.
     """
     task = env.task.name
     reset_key, act_key = jax.random.split(key)
@@ -51,7 +52,8 @@ def first_episodes(
         action, memory = act(params, memory, state, step_key)
         state = env.step(state, action)
         moved = measures.tracker_step(task, tracker, state)
-        tracker = jax.tree.map(lambda new, old: jnp.where(alive, new, old), moved, tracker)
+        counts = alive & ~state.invalid  # metrics of a broken step are 0, not measurements
+        tracker = jax.tree.map(lambda new, old: jnp.where(counts, new, old), moved, tracker)
         broken = broken | (alive & state.invalid)
         return (state, memory, tracker, alive & ~state.done, broken), None
 

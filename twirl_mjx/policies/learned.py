@@ -69,6 +69,8 @@ class PolicyHeader:
                 raise PolicyFileError(f"{name} must be at least 1, got {getattr(self, name)}")
         if not self.control_dt > 0.0:
             raise PolicyFileError(f"control_dt must be positive (s), got {self.control_dt}")
+        if not isinstance(self.card, dict):
+            raise PolicyFileError(f"the card must be a JSON object, got {self.card!r}")
         rows = tuple((str(n), int(a), int(b), str(u)) for n, a, b, u in self.observation_layout)
         object.__setattr__(self, "observation_layout", rows)
         end = 0

@@ -9,13 +9,16 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from twirl_mjx.config import SCRIPTED_SOURCES, TrainConfig
+from twirl_mjx import config_json
+from twirl_mjx.checks import check_choice
+from twirl_mjx.config import SCRIPTED_SOURCES, TASKS, TrainConfig
 from twirl_mjx.policies import scripted
 from twirl_mjx.policies.clip import ClipPolicy
 from twirl_mjx.policies.function import from_policy
-from twirl_mjx.policies.learned import NumpyPolicy, PolicyHeader, load_policy
+from twirl_mjx.policies.learned import NumpyPolicy, PolicyFileError, PolicyHeader, load_policy
 from twirl_mjx.policies.onnx_file import OnnxPolicy
 from twirl_mjx.policies.source import ActOnObs, ObservingSource, OwnTaskSource, actor_act
+from twirl_mjx.presets import make_config
 from twirl_mjx.tasks.imitate import load_clip
 from twirl_mjx.tasks.observations import layout_size
 from twirl_mjx.tasks.registry import make_task
@@ -43,14 +46,14 @@ def resolve_policy(name: str, config: TrainConfig, *, noise: bool = False) -> Re
 
     Raises:
         FileNotFoundError: Nothing to load there.
-        PolicyFileError: The file is no policy.
+        PolicyFileError: The file is no policy, or of a task or with options unknown here.
         ValueError: The policy takes observations of another size than its task shows.
     """
     if name in SCRIPTED_SOURCES:
         return ResolvedPolicy(_scripted(name, config), f"scripted {name}", None)
     loaded = load_policy(Path(name))
     task = config.task if loaded.header is None else loaded.header.task
-    own = config_of_source(config, loaded.header)
+    own = config_of_source(config, loaded.header, name)
     observer = make_task(own).observer
     size = layout_size(observer.layout)
     if size != loaded.observation_size:
@@ -64,16 +67,61 @@ def resolve_policy(name: str, config: TrainConfig, *, noise: bool = False) -> Re
     return ResolvedPolicy(policy, name, None if loaded.header is None else task, loaded)
 
 
-def config_of_source(config: TrainConfig, header: PolicyHeader | None) -> TrainConfig:
-    """Return the config under which a policy observes: its own task and that task's options."""
+def config_of_source(
+    config: TrainConfig, header: PolicyHeader | None, origin: str = "the policy"
+) -> TrainConfig:
+    """Return the config under which a policy observes: its own task and that task's options.
+
+    Args:
+        config: Config of the worlds; kept as it is where these are of the policy's own task.
+        header: What the policy says about itself; None if it says nothing.
+        origin: What an error calls the policy, its file for example.
+
+    Raises:
+        PolicyFileError: A task, or an option on its card, that this version does not have.
+    """
     if header is None or header.task == config.task:
         return config
-    options = {  # JSON has no tuples
-        name: tuple(value) if isinstance(value, list) else value
-        for name, value in header.card.get("options", {}).items()
-    }
-    own = dataclasses.replace(getattr(config, header.task), **options)
+    return with_card_options(config, header, origin)
+
+
+def config_of_card(header: PolicyHeader, origin: str) -> TrainConfig:
+    """Return the paper's config of a policy's own task, with the task options on its card.
+
+    Raises:
+        PolicyFileError: As :func:`config_of_source`.
+    """
+    _check_task(header, origin)
+    return with_card_options(make_config(header.task), header, origin)
+
+
+def with_card_options(config: TrainConfig, header: PolicyHeader, origin: str) -> TrainConfig:
+    """Return the config in a policy's own task, with the task options on its card.
+
+    Options that the card does not have stay those of the config.
+
+    Raises:
+        PolicyFileError: As :func:`config_of_source`.
+    """
+    _check_task(header, origin)
+    base = getattr(config, header.task)
+    given = header.card.get("options", {})
+    try:
+        values = dataclasses.asdict(base) | dict(given)
+        own = config_json.from_dict(type(base), values, f"the options of task {header.task}")
+    except (TypeError, ValueError) as error:
+        raise PolicyFileError(
+            f"{origin}: the options on its card are {given!r}, which this version does not"
+            f" understand: {error}"
+        ) from error
     return dataclasses.replace(config, task=header.task, **{header.task: own})
+
+
+def _check_task(header: PolicyHeader, origin: str) -> None:
+    try:
+        check_choice("task", header.task, TASKS)
+    except (TypeError, ValueError) as error:
+        raise PolicyFileError(f"{origin}: {error}") from error
 
 
 def _act_of(loaded: NumpyPolicy | OnnxPolicy, noise: bool) -> ActOnObs:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import zipfile
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -102,11 +104,18 @@ def read(
 
 def _load(path: Path) -> tuple[DatasetHeader, dict[str, np.ndarray]]:
     try:
-        with np.load(path, allow_pickle=False) as archive:
+        with path.open("rb") as file:
+            archive = np.load(file, allow_pickle=False)
+            if isinstance(archive, np.ndarray):
+                raise ValueError("it holds one array, not an archive")
             arrays = {name: archive[name] for name in archive.files}
         record = json.loads(str(arrays.pop("header")))
-    except (OSError, ValueError, KeyError, EOFError) as error:
-        raise DatasetError(f"{path} is not a readable source dataset: {error}") from error
+        if not isinstance(record, dict):
+            raise ValueError(f"its header is {record!r}, not a JSON object")
+    except (zipfile.BadZipFile, zlib.error, EOFError, OSError, ValueError, KeyError) as error:
+        raise DatasetError(
+            f"{path} is not a readable source dataset: {error}; remove it and collect again"
+        ) from error
     if record.get("format") != FORMAT or record.get("version") != VERSION:
         raise DatasetError(
             f"{path} is {record.get('format')!r} version {record.get('version')}, this program"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import dataclasses
 import statistics
@@ -59,11 +60,18 @@ def measure(runs: Path) -> list[Speed]:
 
 
 def _rates(path: Path) -> tuple[float, float] | None:
+    """Return the median transitions and updates per second of the whole rows of a run."""
     values: dict[str, list[float]] = {"env_steps_per_s": [], "updates_per_s": []}
     with path.open(newline="") as file:
-        for row in csv.DictReader(file):
-            if row["metric"] in values and row["grad_steps"] not in ("", "0"):
-                values[row["metric"]].append(float(row["value"]))
+        rows = csv.reader(line for line in file if line.endswith("\n"))
+        header = next(rows, [])
+        for cells in rows:
+            if len(cells) != len(header):
+                continue  # cut off by a kill, or being written
+            row = dict(zip(header, cells, strict=True))
+            if row.get("metric") in values and row["grad_steps"] not in ("", "0"):
+                with contextlib.suppress(ValueError):
+                    values[row["metric"]].append(float(row["value"]))
     medians = [statistics.median(v) if v else 0.0 for v in values.values()]
     return (medians[0], medians[1]) if min(medians) > 0.0 else None
 

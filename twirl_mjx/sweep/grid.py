@@ -20,6 +20,7 @@ from typing import Any
 from twirl_mjx import config_json
 from twirl_mjx.checks import check_choice
 from twirl_mjx.config import TrainConfig
+from twirl_mjx.config_json import check_type
 from twirl_mjx.presets import PRESETS, make_config
 
 BLOCK_KEYS = ("preset", "seeds", "axes", "base", "nominal")
@@ -157,10 +158,11 @@ def configure(preset: str, settings: Settings, where: str) -> TrainConfig:
     """Return a preset's config of ``settings["task"]`` with all settings applied at once.
 
     Raises:
-        ValueError: An unknown field (with the nearest), or a value out of range.
+        ValueError: An unknown field (with the nearest), or a value of another type or out of range.
     """
     if "task" not in settings:
         raise ValueError(f"{where} has no 'task'")
+    check_type(f"{where}: task", settings["task"], str)
     try:
         plain = dataclasses.asdict(make_config(settings["task"], preset))
         for field, value in settings.items():

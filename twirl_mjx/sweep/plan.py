@@ -96,14 +96,23 @@ def given_nominals(paths: Sequence[Path]) -> dict[str, Path]:
 
 
 def resolve(draft: Draft, runs: Path, given: Mapping[str, Path], cells: dict[str, Cell]) -> Cell:
-    """Add a draft's cell to ``cells``, after the runs it needs; return it."""
+    """Add a draft's cell to ``cells``, after the runs it needs; return it.
+
+    Raises:
+        ValueError: Its run is that of another arm already; the message names both arms.
+    """
     identity, place, needs = _source_of(draft, runs, given, cells)
     config = dataclasses.replace(draft.config, source=identity)
     name = run_name(config)
     if not draft.arm and (adopted := _adoptable(draft, runs)):
         name = adopted
-    if name in cells and cells[name].arm:
-        return cells[name]
+    if (known := cells.get(name)) and known.arm:
+        if draft.arm not in ("", known.arm):
+            raise ValueError(
+                f"arms {known.arm!r} and {draft.arm!r} have equal settings: both are the run"
+                f" {name}, which one table can hold (drop one arm, or change a setting of it)"
+            )
+        return known
     cell = Cell(name, draft.arm, draft.preset, config, place, needs)
     cells[name] = cell
     return cell
@@ -112,7 +121,11 @@ def resolve(draft: Draft, runs: Path, given: Mapping[str, Path], cells: dict[str
 def _source_of(
     draft: Draft, runs: Path, given: Mapping[str, Path], cells: dict[str, Cell]
 ) -> tuple[str, str, tuple[str, ...]]:
-    """Return what the source is, where it lies, and the names of the runs needed for it."""
+    """Return what the source is, where it lies, and the names of the runs needed for it.
+
+    The rules are those of ``training.pipeline.find_source``, which cannot be asked, as it trains
+    what is missing; a test compares the two.
+    """
     config = draft.config
     if config.variant == "scratch":
         return "auto", "auto", ()
@@ -128,10 +141,14 @@ def _source_of(
             return _identity_of_path(path), str(path.resolve()), ()
         return _needed(_nominal_draft(draft), runs, given, cells)
     task = source_task_of(config)
-    shipped = _shipped(task)
-    if config.source == "auto" and draft.preset != "debug" and shipped is not None:
-        return _identity_of_path(shipped), "auto", ()
-    return _needed(Draft("", draft.preset, make_config(task, draft.preset), ()), runs, given, cells)
+    plain = make_config(task, draft.preset)
+    options = getattr(config, task)
+    if config.source == "auto" and draft.preset != "debug" and options == getattr(plain, task):
+        shipped = _shipped(task)
+        if shipped is not None:
+            return _identity_of_path(shipped), "auto", ()
+    first = dataclasses.replace(plain, seed=config.seed, **{task: options})
+    return _needed(Draft("", draft.preset, first, ()), runs, given, cells)
 
 
 def _needed(
@@ -233,12 +250,13 @@ def is_finished(cell: Cell, runs: Path) -> bool:
 
 
 def status_of(cell: Cell, runs: Path) -> Status:
-    """Return how far a cell is."""
+    """Return how far a cell is; a run is finished when its process has let go of it, too."""
     run_dir = runs / cell.name
-    if is_finished(cell, runs):
-        return "finished"
+    finished = is_finished(cell, runs)
     if rundir.owner(run_dir) is not None:
         return "in use"
+    if finished:
+        return "finished"
     return "cut off" if reached_steps(run_dir) else "missing"
 
 

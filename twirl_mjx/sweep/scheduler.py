@@ -11,9 +11,11 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Literal, Protocol
 
-from twirl_mjx.sweep.worker import Ending, Job, run_job
+from twirl_mjx.sweep.plan import Status
+from twirl_mjx.sweep.worker import BUSY, Ending, Job, run_job
 
-State = Literal["waiting", "running", "done", "failed", "blocked", "stopped"]
+State = Literal["waiting", "running", "busy", "done", "failed", "blocked", "stopped"]
+"""``busy``: another process works on the run, which is waited for."""
 
 OBJECT_STORE_BYTES = 80 * 2**20
 """Ray's smallest object store; jobs hand over a few words."""
@@ -23,8 +25,8 @@ NO_RETRY = 2
 """Exit status of unusable arguments: another attempt would end the same way."""
 STOPPED = 130
 """Exit status of a run that was asked to stop and saved itself."""
-STOP_WAIT_S = 120.0
-"""Time for all running jobs to stop."""
+BUSY_LOOK_S = 10.0
+"""Time between two looks at a run that another process works on, s."""
 
 
 @dataclasses.dataclass
@@ -42,6 +44,8 @@ class Progress:
     """Why it did not finish."""
     where: str = ""
     """Machine and core of the last attempt."""
+    look_at: float = 0.0
+    """Monotonic time of the next look at a busy run, s."""
 
 
 class Executor(Protocol):
@@ -65,6 +69,10 @@ class Executor(Protocol):
 
     def stop(self, handle: Any) -> None:
         """Ask a running job to save and stop."""
+        ...
+
+    def kill(self, handle: Any) -> None:
+        """End a running job at once."""
         ...
 
 
@@ -143,6 +151,10 @@ class RayExecutor:
         """Interrupt the task, which asks its child to stop."""
         self._ray.cancel(handle, force=False)
 
+    def kill(self, handle: Any) -> None:
+        """End the worker of the task, and with it the child."""
+        self._ray.cancel(handle, force=True)
+
 
 def _start(ray: Any, options: dict[str, Any]) -> None:
     """Start or join Ray; a busy machine gets several attempts, as Ray itself gives it 30 s.
@@ -170,6 +182,8 @@ def run_all(
     retries: int,
     stop: threading.Event,
     show: Callable[[Mapping[str, Progress]], None],
+    look: Callable[[Job], Status] = lambda job: "missing",
+    say: Callable[[str], None] = lambda text: None,
     poll_s: float = 1.0,
 ) -> dict[str, Progress]:
     """Run every job after those it needs; one that fails takes only its dependants along.
@@ -180,6 +194,8 @@ def run_all(
         retries: Further attempts after a crash.
         stop: When set, running jobs are asked to stop and nothing new is started.
         show: Called after every change and about once per ``poll_s``.
+        look: Returns how far a job is before it is started, as other processes may work on it.
+        say: Prints one line for a person.
         poll_s: Longest time between two looks, s.
 
     Returns:
@@ -189,30 +205,58 @@ def run_all(
     handles: dict[Any, Progress] = {}
     while not stop.is_set():
         _block(table)
-        for progress in _ready(table)[: max(0, executor.capacity() - len(handles))]:
-            progress.state, progress.began = "running", time.monotonic()
-            progress.attempts += 1
-            handles[executor.submit(progress.job)] = progress
+        room = executor.capacity()
+        for progress in _ready(table):
+            if len(handles) >= room:
+                break
+            if _is_to_start(progress, look):
+                progress.state, progress.began = "running", time.monotonic()
+                progress.attempts += 1
+                handles[executor.submit(progress.job)] = progress
         show(table)
         if not handles:
-            if all(progress.state != "waiting" for progress in table.values()):
+            if all(progress.state not in ("waiting", "busy") for progress in table.values()):
                 break
-            time.sleep(poll_s)  # a cluster without room at the moment
+            stop.wait(poll_s)  # no room at the moment, or others have to finish first
             continue
         for handle in executor.finished(list(handles), poll_s):
             _settle(handles.pop(handle), handle, executor, retries)
     if handles:
-        _stop_all(handles, executor, show=lambda: show(table))
+        _stop_all(handles, executor, show=lambda: show(table), say=say)
     show(table)
     return table
 
 
 def _ready(table: Mapping[str, Progress]) -> list[Progress]:
+    now = time.monotonic()
     return [
         p
         for p in table.values()
-        if p.state == "waiting" and all(table[n].state == "done" for n in p.job.needs if n in table)
+        if (p.state == "waiting" or (p.state == "busy" and now >= p.look_at))
+        and all(table[n].state == "done" for n in p.job.needs if n in table)
     ]
+
+
+def _is_to_start(progress: Progress, look: Callable[[Job], Status]) -> bool:
+    """Look at the run of a job; enter it as done, busy or failed where it is not to be started."""
+    try:
+        status = look(progress.job)
+    except (ValueError, OSError) as error:  # a run directory that cannot be read
+        progress.state, progress.reason = "failed", str(error)
+        return False
+    if status == "in use":
+        _set_busy(progress)
+    elif status == "finished":
+        progress.state, progress.began, progress.reason = "done", time.monotonic(), ""
+        progress.where = progress.where or "another process"
+    else:
+        progress.reason = ""
+    return status in ("missing", "cut off")
+
+
+def _set_busy(progress: Progress) -> None:
+    progress.state, progress.reason = "busy", "in use by another process"
+    progress.look_at = time.monotonic() + BUSY_LOOK_S
 
 
 def _block(table: Mapping[str, Progress]) -> None:
@@ -227,7 +271,10 @@ _LOST = ("failed", "blocked", "stopped")
 
 
 def _settle(progress: Progress, handle: Any, executor: Executor, retries: int) -> None:
-    """Enter how an attempt ended: done, to be tried again, stopped or failed."""
+    """Enter how an attempt ended: done, to be tried again, stopped or failed.
+
+    An attempt that another process was ahead of does not count.
+    """
     progress.seconds = time.monotonic() - progress.began
     try:
         ending = executor.ending(handle)
@@ -238,6 +285,9 @@ def _settle(progress: Progress, handle: Any, executor: Executor, retries: int) -
         progress.reason = _reason(code)
     if code == 0:
         progress.state = "done"
+    elif code == BUSY:
+        progress.attempts -= 1
+        _set_busy(progress)
     elif code == STOPPED:
         progress.state = "stopped"
     elif code != NO_RETRY and progress.attempts <= retries:
@@ -252,17 +302,28 @@ def _reason(code: int) -> str:
     return f"killed by {signal.Signals(-code).name}" if code < 0 else f"exit status {code}"
 
 
-def _stop_all(handles: dict[Any, Progress], executor: Executor, show: Callable[[], None]) -> None:
-    """Ask what runs to stop and wait for it."""
-    for handle in handles:
-        executor.stop(handle)
-    deadline = time.monotonic() + STOP_WAIT_S
-    while handles and time.monotonic() < deadline:
-        for handle in executor.finished(list(handles), 1.0):
-            progress = handles.pop(handle)
-            _settle(progress, handle, executor, 0)
-            if progress.state == "failed":  # cancelled before or while it stopped
-                progress.state = "stopped"
-        show()
-    for progress in handles.values():
-        progress.state, progress.reason = "stopped", "did not stop in time"
+def _stop_all(
+    handles: dict[Any, Progress],
+    executor: Executor,
+    show: Callable[[], None],
+    say: Callable[[str], None],
+) -> None:
+    """Ask what runs to stop and wait for it as long as it takes; a second signal kills it."""
+    say(
+        f"stopping: {len(handles)} runs end their epoch and save, which may take minutes"
+        " (a second signal kills them: they go on from their last checkpoint)"
+    )
+    try:
+        for handle in handles:
+            executor.stop(handle)
+        while handles:
+            for handle in executor.finished(list(handles), 1.0):
+                progress = handles.pop(handle)
+                _settle(progress, handle, executor, 0)
+                if progress.state == "failed":  # cancelled before or while it stopped
+                    progress.state = "stopped"
+            show()
+    except KeyboardInterrupt:
+        for handle, progress in handles.items():
+            executor.kill(handle)
+            progress.state, progress.reason = "stopped", "killed at the second signal"

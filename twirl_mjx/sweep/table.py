@@ -21,7 +21,13 @@ HEARTBEAT_S = 60.0
 """Time between two plain lines about running cells, s."""
 SHOWN = 8
 """Waiting and ended cells shown in the live table; running and failed ones always are."""
-COLOURS = {"running": "cyan", "failed": "red", "blocked": "red", "stopped": "yellow"}
+COLOURS = {
+    "running": "cyan",
+    "busy": "yellow",
+    "failed": "red",
+    "blocked": "red",
+    "stopped": "yellow",
+}
 
 
 class SweepView:
@@ -69,16 +75,17 @@ class SweepView:
         for name, progress in table.items():
             state = (progress.state, progress.attempts)
             if self._seen.get(name, ("waiting", 0)) != state:
-                self._say(self._line(progress))
+                self.say(self._line(progress))
             self._seen[name] = state
         if time.monotonic() - self._beat > HEARTBEAT_S:
             self._beat = time.monotonic()
             for progress in table.values():
                 if progress.state == "running":
-                    self._say(self._line(progress))
-            self._say(self._summary())
+                    self.say(self._line(progress))
+            self.say(self._summary())
 
-    def _say(self, text: str) -> None:
+    def say(self, text: str) -> None:
+        """Print one line, above the live table where there is one."""
         self._console.print(Text(text), soft_wrap=True)
 
     def _line(self, progress: Progress) -> str:
@@ -115,7 +122,7 @@ class SweepView:
         by = {state: [p for p in self._table.values() if p.state == state] for state in _ORDER}
         ended = sorted(by["done"], key=lambda p: p.began)[-SHOWN:]
         return [
-            *ended, *by["failed"], *by["stopped"], *by["running"],
+            *ended, *by["failed"], *by["stopped"], *by["running"], *by["busy"][:SHOWN],
             *by["waiting"][:SHOWN], *by["blocked"][:SHOWN],
         ]  # fmt: skip
 
@@ -136,7 +143,7 @@ class SweepView:
         return frame
 
 
-_ORDER = ("done", "failed", "stopped", "running", "waiting", "blocked")
+_ORDER = ("done", "failed", "stopped", "running", "busy", "waiting", "blocked")
 
 
 def plan_table(

@@ -17,8 +17,14 @@ from pathlib import Path
 
 from twirl_mjx.sweep import launch
 
-STOP_S = 90.0
-"""Time a child has to save its state after it was asked to stop."""
+POLL_S = 0.5
+"""Time between two looks at a child, s; Ray interrupts a worker between two instructions only."""
+FAILED = 1
+"""Exit status of a run that failed, also because another process holds its directory."""
+BUSY = 75
+"""Code of an ending of the latter kind: temporary, and no fault of the run (sysexits.h)."""
+BUSY_TEXT = " is in use by "
+"""What a run says then (``training.rundir.RunBusyError``)."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,7 +46,7 @@ class Ending:
     """How one attempt ended."""
 
     code: int
-    """Exit status of the process; negative: killed by that signal."""
+    """Exit status of the process, or ``BUSY``; negative: killed by that signal."""
     where: str
     """Machine and core."""
 
@@ -71,11 +77,15 @@ def claim_core() -> Iterator[int | None]:
 def run_job(job: Job, *, pin: bool = True) -> Ending:
     """Run a job as a child process and wait for it.
 
-    The child dies with this process. ``KeyboardInterrupt`` asks it to save and stop.
+    The child dies with this process. ``KeyboardInterrupt`` asks it to save and stop, which may
+    take an epoch; a second one kills it.
 
     Args:
         job: What to run.
         pin: Give it a core of its own; not useful where the work is on an accelerator.
+
+    Raises:
+        KeyboardInterrupt: At the second interrupt.
     """
     log = Path(job.log)
     log.parent.mkdir(parents=True, exist_ok=True)
@@ -84,6 +94,7 @@ def run_job(job: Job, *, pin: bool = True) -> Ending:
         stamp = time.strftime("%Y-%m-%d %H:%M:%S")
         file.write(f"== {stamp} on {place}: {' '.join(job.argv)}\n")
         file.flush()
+        start = file.tell()
         target = "-" if core is None else str(core)
         command = [sys.executable, "-S", launch.__file__, str(os.getpid()), target]
         child = subprocess.Popen(
@@ -91,6 +102,7 @@ def run_job(job: Job, *, pin: bool = True) -> Ending:
             stdin=subprocess.DEVNULL,
             stdout=file,
             stderr=subprocess.STDOUT,
+            process_group=0,  # Ctrl-C is the sweep's: a run asked twice would end without saving
         )
         try:
             code = _wait(child)
@@ -99,12 +111,25 @@ def run_job(job: Job, *, pin: bool = True) -> Ending:
                 child.kill()
                 child.wait()
         file.write(f"== ended with {code}\n")
-    return Ending(code, place)
+    return Ending(BUSY if code == FAILED and _was_refused(log, start) else code, place)
 
 
 def _wait(child: subprocess.Popen[bytes]) -> int:
     try:
-        return child.wait()
+        return _exit_status(child)
     except KeyboardInterrupt:
         child.send_signal(signal.SIGTERM)
-        return child.wait(STOP_S)
+        return _exit_status(child)
+
+
+def _exit_status(child: subprocess.Popen[bytes]) -> int:
+    while (code := child.poll()) is None:
+        time.sleep(POLL_S)
+    return code
+
+
+def _was_refused(log: Path, start: int) -> bool:
+    """Return whether a run said after byte ``start`` of its log that another process holds it."""
+    with log.open("rb") as file:
+        file.seek(start)
+        return BUSY_TEXT.encode() in file.read()

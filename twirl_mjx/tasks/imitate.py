@@ -7,8 +7,8 @@ Whenever the clip loops, the reference moves to where the robot is (root xy only
 Terminates when the root is ``max_root_error`` or ``max_root_angle`` away from the reference, or
 trunk, hips, thighs or knees touch the ground. The lower ends of the calves do not count: in the
 clip's own crouch they are 6 mm above the ground, and feet sink in when they land.
-The reference lives on flat ground; on other ground its height is taken as a height over the ground
-under the robot.
+The reference lives on flat ground. On other ground the reward takes its height as one over the
+ground under the robot; the observation goes on showing heights over the world's zero.
 """
 
 from __future__ import annotations

@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 import orbax.checkpoint as ocp
 
+from twirl_mjx.training import rundir
 from twirl_mjx.training.state import TrainState
 
 KEEP = 2
@@ -100,10 +101,10 @@ class Checkpoints:
         """Write a checkpoint; a second save at the same env steps does nothing.
 
         Args:
-            state: State of one run, or of several with a leading seed axis.
+            state: State of one run.
             progress: JSON-able facts of the Python loop (best score, wall time, ...).
         """
-        step = int(np.max(np.asarray(state.env_steps)))
+        step = int(state.env_steps)
         if step in self._manager.all_steps():
             return
         self._append_rows(state)
@@ -253,6 +254,8 @@ def load_learner(run_dir: Path) -> dict[str, Any]:
 def load_replay(run_dir: Path) -> np.ndarray:
     """Return the packed rows [n, W] of the online ring at a run's newest checkpoint, in order.
 
+    The log also keeps rows that the ring has overwritten since; they are left out.
+
     Raises:
         FileNotFoundError: The run has no checkpoint or no stored experience.
     """
@@ -264,4 +267,6 @@ def load_replay(run_dir: Path) -> np.ndarray:
     if not paths:
         raise FileNotFoundError(f"{run_dir} has no stored experience")
     first = int(paths[0].stem.split("_")[1])
-    return np.concatenate([np.load(path) for path in paths])[: total - first]
+    capacity = rundir.read_config(run_dir).replay.capacity
+    kept = slice(max(0, total - capacity - first), total - first)
+    return np.concatenate([np.load(path) for path in paths])[kept]

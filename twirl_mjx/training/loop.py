@@ -90,8 +90,7 @@ def check_finite(learner: DroqState) -> None:
     Raises:
         DivergedError: Naming the first tensor that is not.
     """
-    floats = jax.tree.map(lambda x: x, learner)
-    for path, good in jax.tree_util.tree_flatten_with_path(_finite(floats))[0]:
+    for path, good in jax.tree_util.tree_flatten_with_path(_finite(learner))[0]:
         if not bool(good):
             name = jax.tree_util.keystr(path, simple=True, separator=".")
             raise DivergedError(
@@ -120,6 +119,7 @@ class Run:
         self.stage = stage
         self.source = source
         self.source_rows = 0.0 if source is None else float(source.size)
+        self.took_weights = False
         self.progress: dict[str, Any] = {"best": -math.inf, "wall_s": 0.0, "inserted": 0}
         env = make_env(config, num_envs=config.eval.episodes)
         self._evaluate = make_evaluate(env, no_memory, act_mean)
@@ -140,6 +140,7 @@ class Run:
             made = jax.jit(fresh)(key)
             if initial is not None:
                 made = made.replace(learner=initial(made.learner))
+                self.took_weights = True
         else:
             made, progress = self.checkpoints.restore(jax.eval_shape(fresh, key))
             self.progress |= progress
@@ -187,6 +188,9 @@ class Run:
         saved = began = time.monotonic()
         before = self.progress["wall_s"]
         first = True
+        if self.took_weights:  # what training has to beat
+            with logger.aside("evaluating the weights taken over ..."):
+                logger.log(0, 0, self.evaluate(train_state))
         while (steps := int(train_state.env_steps)) < config.total_env_steps and not stop.is_set():
             if first:
                 with logger.compiling("train_epoch"):
@@ -237,13 +241,13 @@ def train(
     """
     if config.uses_source_data and source is None:
         raise ValueError(f"variant {config.variant} with phi {config.replay.phi} needs source data")
+    rundir.check_run(run_dir, config)
+    if (done := finished(run_dir, config.total_env_steps)) is not None:
+        return done
     run = Run(config, run_dir, source, stage)
     try:
         train_state = run.start(initial)
         steps = int(train_state.env_steps)
-        done = finished_evaluation(run_dir, steps) if steps >= config.total_env_steps else None
-        if done is not None:
-            return Outcome(True, steps, done)
         with (
             stop_on_signal() as stop,
             RunLogger(
@@ -281,18 +285,20 @@ def final_evaluation(config: TrainConfig, run_dir: Path, env_steps: int) -> dict
     return {name: float(np.mean(v)) for name, v in values.items()}
 
 
-def finished_evaluation(run_dir: Path, env_steps: int) -> dict[str, float] | None:
-    """Return the mean measures in ``eval.csv`` if it closes a run of ``env_steps``, else None."""
+def finished(run_dir: Path, total_env_steps: int) -> Outcome | None:
+    """Return how a run ended if its ``eval.csv`` closes at least ``total_env_steps``, else None."""
     path = run_dir / EVAL_CSV
     if not path.is_file():
         return None
     values: dict[str, list[float]] = {}
+    env_steps = 0
     with path.open(newline="") as file:
         for row in csv.DictReader(file):
-            if int(row["env_steps"]) != env_steps:
-                return None
+            env_steps = int(row["env_steps"])
             values.setdefault(row["metric"], []).append(float(row["value"]))
-    return {name: float(np.mean(column)) for name, column in values.items()}
+    if env_steps < total_env_steps:
+        return None
+    return Outcome(True, env_steps, {name: float(np.mean(v)) for name, v in values.items()})
 
 
 def write_episodes(

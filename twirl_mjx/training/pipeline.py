@@ -1,8 +1,8 @@
 """From one command to a trained policy: source, collection, training; each stage resumes.
 
 ``train TASK`` = find or train the source policy -> collect its experience in the target task ->
-TWiRL. The variants are settings of the same program (paper, section "Method"). Under a dynamics shift the
-source is a finished nominal run of the same task, and its replay is the source data.
+TWiRL. The variants are settings of the same program (paper, section "Method"). Under a dynamics
+shift the source is a finished nominal run of the same task, and its replay is the source data.
 """
 
 from __future__ import annotations
@@ -22,34 +22,17 @@ from twirl_mjx import config_json
 from twirl_mjx.assets import asset_path
 from twirl_mjx.config import SCRIPTED_SOURCES, TrainConfig
 from twirl_mjx.droq.state import DroqState
-from twirl_mjx.policies.learned import NumpyPolicy, hidden_layers
 from twirl_mjx.policies.resolve import resolve_policy
-from twirl_mjx.presets import PRESETS, make_config, source_task_of, starts_from_nominal_run
+from twirl_mjx.presets import make_config, source_task_of, starts_from_nominal_run
 from twirl_mjx.replay import dataset, ring
 from twirl_mjx.tasks.imitate import load_clip
-from twirl_mjx.tasks.registry import make_env, make_task
+from twirl_mjx.tasks.registry import make_env
 from twirl_mjx.training import loop, rundir
-from twirl_mjx.training.checkpoint import load_learner, load_replay
-from twirl_mjx.training.source import collect
-from twirl_mjx.types import SourcePolicy
+from twirl_mjx.training.checkpoint import load_replay
+from twirl_mjx.training.source import Source, collect
+from twirl_mjx.training.weights import check_weights_fit, source_weights
 
 Say = Callable[[str], None]
-
-
-@dataclasses.dataclass(frozen=True)
-class Source:
-    """A resolved source: the policy, where it came from, and its run if it has one."""
-
-    policy: SourcePolicy
-    origin: str
-    digest: str
-    numpy_policy: Any = None
-    run_dir: Path | None = None
-
-    @property
-    def identity(self) -> dict[str, str]:
-        """What a run directory remembers of its source."""
-        return {"origin": self.origin, "digest": self.digest}
 
 
 class StoppedError(RuntimeError):
@@ -77,18 +60,33 @@ def run(config: TrainConfig, preset: str, runs_dir: Path, name: str | None, say:
     run_dir = runs_dir / (name or rundir.default_name(config, preset))
     if config.variant == "scratch":
         with rundir.exclusive(run_dir):
+            if is_finished(config, run_dir, None, say):
+                return run_dir
             return _train(config, run_dir, None, None)
     check_weights_fit(config, preset)
     source = find_source(config, preset, runs_dir, say)
+    initial = source_weights(config, source, say) if config.uses_source_weights else None
     with rundir.exclusive(run_dir):
+        if is_finished(config, run_dir, source, say):
+            return run_dir
         rundir.open_run(run_dir, config, source.identity)
         if config.variant == "zero-shot":
             return zero_shot(config, run_dir, source, say)
-        initial = None
-        if config.variant in ("weights", "twirl+weights"):
-            initial = source_weights(config, source, say)
         data = source_data(config, run_dir, source, say) if config.uses_source_data else None
         return _train(config, run_dir, data, initial)
+
+
+def is_finished(config: TrainConfig, run_dir: Path, source: Source | None, say: Say) -> bool:
+    """Return whether a run was trained and evaluated to its budget; nothing in it is touched.
+
+    Raises:
+        RunMismatchError: Another run lives there.
+    """
+    rundir.check_run(run_dir, config, source.identity if source else None)
+    if config.variant == "zero-shot" or not loop.finished(run_dir, config.total_env_steps):
+        return False
+    say(f"{run_dir} is finished")
+    return True
 
 
 def _train(
@@ -150,18 +148,17 @@ def scripted_digest(config: TrainConfig) -> str:
 
 
 def _nominal_run(config: TrainConfig, preset: str, runs_dir: Path) -> Source:
-    """Return the finished run of the same task without a shift."""
+    """Return the finished run of the same task and preset without a shift."""
     variant = make_config(config.task, preset).variant
     nominal = dataclasses.replace(config, shift="none", variant=variant)
-    presets = (preset, *(p for p in PRESETS if p != preset))
-    tried = [runs_dir / rundir.default_name(nominal, p) for p in presets]
-    for run_dir in tried:
-        if (run_dir / loop.EVAL_CSV).is_file():
-            return _from_path(config, run_dir)
+    run_dir = runs_dir / rundir.default_name(nominal, preset)
+    if (run_dir / loop.EVAL_CSV).is_file():
+        return _from_path(config, run_dir)
+    others = sorted(path.parent.name for path in runs_dir.glob(f"{config.task}-*/{loop.EVAL_CSV}"))
     raise FileNotFoundError(
-        f"adapting {config.task} to {config.shift} starts from a finished nominal run;"
-        f" looked for {', '.join(map(str, tried))}. Run `make train TASK={config.task}` first,"
-        " or name a run or policy with --source"
+        f"adapting {config.task} to {config.shift} starts from a finished nominal run; there is"
+        f" no {run_dir}. Run `make train TASK={config.task}` first, or name a run or policy with"
+        f" --source (finished in {runs_dir}: {', '.join(others) or 'none'})"
     )
 
 
@@ -231,9 +228,12 @@ def collection_digest(config: TrainConfig, source: Source) -> str:
 
 def write_dataset(config: TrainConfig, source: Source, path: Path, digest: str, say: Say) -> Any:
     """Collect ``config.replay.source_size`` transitions and write them to ``path``."""
-    env = make_env(config)
+    size = config.replay.source_size
+    # Whole episodes: with more worlds the data would hold nothing but their beginnings.
+    worlds = min(config.env.num_envs, max(1, size // config.env.episode_length))
+    env = make_env(config, num_envs=worlds)
     key = jax.random.fold_in(jax.random.key(config.seed), 0x50)
-    data, means = collect(env, source.policy, key, config.replay.source_size)
+    data, means = collect(env, source.policy, key, size)
     say("source policy in the target task: " + describe(means))
     header = dataset.DatasetHeader(
         task=config.task,
@@ -252,73 +252,6 @@ def write_dataset(config: TrainConfig, source: Source, path: Path, digest: str, 
 def describe(means: dict[str, float]) -> str:
     """Return measures as one line of text."""
     return ", ".join(f"{k} {v:.3g}" for k, v in means.items()) or "no episode ended"
-
-
-def check_weights_fit(config: TrainConfig, preset: str) -> None:
-    """Refuse a variant that needs the networks of a source that cannot fit, before any stage.
-
-    Raises:
-        ValueError: The default source observes differently.
-    """
-    needs = config.variant in ("weights", "twirl+weights")
-    if needs and config.source in ("auto", "train") and not starts_from_nominal_run(config, preset):
-        task = source_task_of(config)
-        check_layouts(config, task, f"the source task {task}")
-
-
-def check_layouts(config: TrainConfig, task: str, origin: str) -> None:
-    """Check that a policy of ``task`` observes what ``config.task`` shows.
-
-    Raises:
-        ValueError: It does not; the message names ``origin``.
-    """
-    own = make_task(dataclasses.replace(config, task=task)).observer.layout
-    if own != make_task(config).observer.layout:
-        raise ValueError(
-            f"{origin} observes as task {task}, not as {config.task}:"
-            " its weights do not fit (nearest variant: 'twirl')"
-        )
-
-
-def source_weights(
-    config: TrainConfig, source: Source, say: Say
-) -> Callable[[DroqState], DroqState]:
-    """Return a function that writes the source's networks into a fresh learner.
-
-    A run directory gives actor, critics and temperature; a policy file only the actor.
-
-    Raises:
-        ValueError: The source has no networks, or its observations or layer sizes differ.
-    """
-    policy = source.numpy_policy
-    if not isinstance(policy, NumpyPolicy):
-        raise ValueError(f"{source.origin} has no network weights (nearest variant: 'twirl')")
-    check_layouts(config, policy.header.task, source.origin)
-    sizes = tuple(
-        len(policy.actor_params[name]["bias"]) for name in hidden_layers(policy.actor_params)
-    )
-    if sizes != config.droq.hidden_sizes:
-        raise ValueError(
-            f"{source.origin} has hidden layers of {sizes} units, this run"
-            f" {config.droq.hidden_sizes} (nearest: --droq.hidden-sizes"
-            f" {' '.join(map(str, sizes))})"
-        )
-    actor = jax.tree.map(jnp.asarray, dict(policy.actor_params))
-    learner = load_learner(source.run_dir) if source.run_dir else None
-    if learner is None:
-        say(f"weights: the actor of {source.origin}; a policy file has no critics")
-
-    def initial(fresh: DroqState) -> DroqState:
-        if learner is None:
-            return fresh.replace(actor=actor)
-        return fresh.replace(
-            actor=learner["actor"],
-            critic=learner["critic"],
-            target_critic=learner["target_critic"],
-            log_temperature=learner["log_temperature"],
-        )
-
-    return initial
 
 
 def zero_shot(config: TrainConfig, run_dir: Path, source: Source, say: Say) -> Path:

@@ -28,6 +28,8 @@ PACKAGES = (
 )  # fmt: skip
 MAY_CHANGE = ("total_env_steps", "checkpoint_minutes", "eval.", "env.engine", "source")
 """Fields a resumed run may have changed: they do not alter what was done so far."""
+WORK = ("source.npz", "checkpoints", "metrics.csv", "policy.npz", "eval.csv")
+"""What a stage leaves behind; without any of it a directory may be given to another config."""
 READS_OPTIONS_OF = {"stand": ("stand", "biped")}
 """Tasks whose options a task reads, where these are not its own alone (stand shows a goal)."""
 
@@ -99,8 +101,8 @@ def may_change(config: TrainConfig) -> tuple[str, ...]:
     return (*MAY_CHANGE, *(f"{task}." for task in TASKS if task not in read))
 
 
-def open_run(run_dir: Path, config: TrainConfig, source: dict[str, str] | None = None) -> None:
-    """Create a run directory, or check that an existing one belongs to this config.
+def check_run(run_dir: Path, config: TrainConfig, source: dict[str, str] | None = None) -> None:
+    """Check that a run directory belongs to this config, or holds no work yet; touches nothing.
 
     Args:
         run_dir: The directory.
@@ -112,7 +114,7 @@ def open_run(run_dir: Path, config: TrainConfig, source: dict[str, str] | None =
             differences.
     """
     path = run_dir / CONFIG_NAME
-    if path.exists():
+    if path.exists() and any((run_dir / name).exists() for name in WORK):
         old = config_json.from_json(path.read_text())
         changed, free = config_json.diff(old, config), may_change(config)
         lines = [line for line in changed if not line.startswith(free)]
@@ -125,8 +127,17 @@ def open_run(run_dir: Path, config: TrainConfig, source: dict[str, str] | None =
                 f"{run_dir} holds another run; nothing was touched. Differences (there -> here):"
                 f"\n  {shown}\nGive the same settings to resume it, or another --name."
             )
+
+
+def open_run(run_dir: Path, config: TrainConfig, source: dict[str, str] | None = None) -> None:
+    """Create a run directory, or go on with one that belongs to this config.
+
+    Args and errors are those of :func:`check_run`. What is written is of today: config, source and
+    versions of the part of the run that follows.
+    """
+    check_run(run_dir, config, source)
     run_dir.mkdir(parents=True, exist_ok=True)
-    _write(path, config_json.to_json(config))
+    _write(run_dir / CONFIG_NAME, config_json.to_json(config))
     if source:
         _write(run_dir / SOURCE_NAME, json.dumps(source, indent=2, sort_keys=True) + "\n")
     _write(run_dir / VERSIONS_NAME, json.dumps(versions(), indent=2, sort_keys=True) + "\n")

@@ -1,8 +1,11 @@
-"""Roll a source policy out in the target task and keep its experience (paper Alg. 1, step 1)."""
+"""A source, and its experience in the target task (paper Alg. 1, step 1)."""
 
 from __future__ import annotations
 
+import dataclasses
 import functools
+from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -11,6 +14,22 @@ import numpy as np
 from twirl_mjx.evaluation import measures
 from twirl_mjx.tasks.vector import VectorEnv, make_transition
 from twirl_mjx.types import SourcePolicy, Transition
+
+
+@dataclasses.dataclass(frozen=True)
+class Source:
+    """A resolved source: the policy, where it came from, and its run if it has one."""
+
+    policy: SourcePolicy
+    origin: str
+    digest: str
+    numpy_policy: Any = None
+    run_dir: Path | None = None
+
+    @property
+    def identity(self) -> dict[str, str]:
+        """What a run directory remembers of its source."""
+        return {"origin": self.origin, "digest": self.digest}
 
 
 def collect(

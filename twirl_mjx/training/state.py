@@ -80,17 +80,16 @@ def collect_step(
 ) -> tuple[TrainState, EnvState]:
     """Act once in every world and insert the transitions.
 
-    Actions are uniformly random in the first ``warmup_env_steps`` transitions.
+    Actions are uniformly random in the first ``warmup_env_steps`` transitions, unless the actor
+    begins with the weights of a source.
     """
     warm_key, act_key = jax.random.split(key)
-    shape = (env.num_envs, env.action_size)
-    action = jnp.where(
-        state.env_steps < config.warmup_env_steps,
-        jax.random.uniform(warm_key, shape, minval=-1.0, maxval=1.0),
-        droq.sample_action(state.learner.actor, state.env.obs, act_key),
-    )
+    action = droq.sample_action(state.learner.actor, state.env.obs, act_key)
+    if not config.uses_source_weights:
+        warm = jax.random.uniform(warm_key, action.shape, minval=-1.0, maxval=1.0)
+        action = jnp.where(state.env_steps < config.warmup_env_steps, warm, action)
     result = env.step(state.env, action)
-    valid = ~result.invalid & jnp.all(jnp.isfinite(action), axis=-1)
+    valid = ~result.invalid
     transition = make_transition(state.env, jnp.nan_to_num(action), result)
     online = ring.insert(state.replay.online, transition, valid)
     state = state.replace(

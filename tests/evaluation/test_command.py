@@ -1,0 +1,141 @@
+"""``twirl evaluate``: every name is good before the first episode, and no result is lost."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from twirl_mjx.commands import evaluate
+from twirl_mjx.commands.render import config_of, name_of
+from twirl_mjx.config import TrainConfig
+from twirl_mjx.policies.learned import PolicyFileError, PolicyHeader, save_policy
+from twirl_mjx.presets import make_config
+from twirl_mjx.training import rundir
+
+
+def save(path: Path, task: str = "stand", **card: object) -> str:
+    """Write a policy of no hidden layers that always answers zero; return its path."""
+    layer = {"kernel": np.zeros((101, 12)), "bias": np.zeros(12)}
+    header = PolicyHeader(task, 101, 12, 0.05, card=dict(card))
+    return str(save_policy(path, {"mean": layer, "log_std": layer}, header))
+
+
+def make_run(path: Path) -> Path:
+    rundir.open_run(path, make_config("stand", "debug"))
+    save(path / "policy.npz")
+    save(path / "policy_last.npz")
+    return path
+
+
+@pytest.fixture
+def scored(monkeypatch: pytest.MonkeyPatch) -> list[TrainConfig]:
+    """The configs that policies were scored under; nothing is simulated."""
+    configs: list[TrainConfig] = []
+
+    def score(config: TrainConfig, policy: object, *, shifts: Any, episodes: int, **_: object):
+        configs.append(config)
+        return {shift: {"return": np.arange(float(episodes))} for shift in shifts}
+
+    monkeypatch.setattr(evaluate, "evaluate_shifts", score)
+    return configs
+
+
+def run(out: Path, *words: str) -> list[dict[str, str]]:
+    fixed = ["--out", str(out), "--shifts", "none", "--episodes", "2"]
+    assert evaluate.main([*words, *fixed]) == 0
+    with out.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def test_a_bad_name_is_found_before_anything_is_scored(
+    scored: list[TrainConfig], tmp_path: Path
+) -> None:
+    out, good = tmp_path / "out" / "table.csv", save(tmp_path / "good.npz")
+    with pytest.raises(FileNotFoundError, match="nowhere"):
+        run(out, "trot", good, "nowhere.npz", "--task", "stand")
+    (tmp_path / "foreign.npz").write_bytes(b"no archive")
+    with pytest.raises(PolicyFileError, match="foreign"):
+        run(out, good, str(tmp_path / "foreign.npz"))
+    with pytest.raises(ValueError, match="option of task biped"):
+        run(out, "trot", good, "--task", "stand", "--goal-distance", "1")
+    assert not scored
+    assert not out.parent.exists()
+
+
+def test_what_is_done_is_kept_when_a_later_policy_fails(
+    scored: list[TrainConfig], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    score = evaluate.evaluate_shifts
+
+    def fail_later(config: TrainConfig, policy: Any, **words: Any) -> Any:
+        if len(scored) == 2:
+            raise RuntimeError("the third")
+        return score(config, policy, **words)
+
+    monkeypatch.setattr(evaluate, "evaluate_shifts", fail_later)
+    out = tmp_path / "table.csv"
+    out.write_text("of yesterday")
+    with pytest.raises(RuntimeError, match="the third"):
+        run(out, "trot", "zero", "bound", "--task", "stand")
+    with out.open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["run"] for row in rows] == ["trot", "trot", "zero", "zero"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["table.csv"]
+
+
+def test_runs_have_the_names_of_their_directories(
+    scored: list[TrainConfig], tmp_path: Path
+) -> None:
+    a, b = make_run(tmp_path / "a"), make_run(tmp_path / "biped-phi0.25-s0")
+    words = [str(a / "policy.npz"), str(b), str(a / "policy_last.npz"), "trot"]
+    rows = run(tmp_path / "table.csv", *words, "--task", "stand")
+    names = list(dict.fromkeys(row["run"] for row in rows))
+    assert names == ["a", "biped-phi0.25-s0", "a-policy_last", "trot"]
+    assert len(rows) == 8
+
+
+@pytest.mark.parametrize(("first", "second"), [("a", "a/policy.npz"), ("a", "c/a")])
+def test_policies_that_the_table_cannot_tell_apart_are_refused(
+    first: str, second: str, scored: list[TrainConfig], tmp_path: Path
+) -> None:
+    make_run(tmp_path / "a")
+    make_run(tmp_path / "c" / "a")
+    with pytest.raises(ValueError, match="would both be 'a' in"):
+        run(tmp_path / "table.csv", str(tmp_path / first), str(tmp_path / second))
+    assert not scored
+
+
+def test_names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(make_run(tmp_path / "run.1"))
+    for given in (".", "policy.npz", "../run.1", "../run.1/"):
+        assert name_of(given) == "run.1"
+    assert name_of("elsewhere/policy.npz") == "elsewhere"  # copied without its config
+    assert name_of("shipped/biped.v2.npz") == "biped.v2"
+    assert name_of("shipped/policy_kneeling.onnx") == "policy_kneeling"
+    assert name_of("clip") == "clip"
+
+
+def test_a_policy_file_is_scored_by_its_own_options(
+    scored: list[TrainConfig], tmp_path: Path
+) -> None:
+    card = {"seed": 7, "env_steps": 64, "variant": "scratch"}
+    for height in ("root", "front_feet"):
+        path = save(tmp_path / f"{height}.npz", options={"height_of": height}, **card)
+        rows = run(tmp_path / "table.csv", path)
+        assert scored.pop().stand.height_of == height
+        told = {tuple(row[k] for k in ("variant", "seed", "env_steps")) for row in rows}
+        assert told == {("scratch", "7", "64")}
+    path = save(tmp_path / "root.npz", options={"height_of": "root"})
+    assert config_of(path, "stand").stand.height_of == "root"
+    foreign = config_of(path, "biped")  # in another task the paper's options of that task
+    assert foreign == make_config("biped")
+
+
+def test_a_policy_file_of_an_unknown_task_is_named(tmp_path: Path) -> None:
+    path = save(tmp_path / "mine.npz", task="crawl")
+    with pytest.raises(PolicyFileError, match=r"mine\.npz: unknown task 'crawl'"):
+        config_of(path, None)

@@ -1,0 +1,92 @@
+"""Networks of a source, taken over by a new run (variants ``weights`` and ``twirl+weights``)."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+
+from twirl_mjx.config import TrainConfig
+from twirl_mjx.droq.state import DroqState
+from twirl_mjx.policies.learned import NumpyPolicy, hidden_layers
+from twirl_mjx.presets import source_task_of, starts_from_nominal_run
+from twirl_mjx.tasks.registry import make_task
+from twirl_mjx.training.checkpoint import load_learner
+from twirl_mjx.training.source import Source
+
+
+def check_weights_fit(config: TrainConfig, preset: str) -> None:
+    """Refuse a variant that needs the networks of a source that cannot fit, before any stage.
+
+    Raises:
+        ValueError: The default source observes differently.
+    """
+    by_default = config.source in ("auto", "train") and not starts_from_nominal_run(config, preset)
+    if config.uses_source_weights and by_default:
+        task = source_task_of(config)
+        check_layouts(config, task, f"the source task {task}")
+
+
+def check_layouts(config: TrainConfig, task: str, origin: str) -> None:
+    """Check that a policy of ``task`` observes what ``config.task`` shows.
+
+    Raises:
+        ValueError: It does not; the message names ``origin``.
+    """
+    own = make_task(dataclasses.replace(config, task=task)).observer.layout
+    if own != make_task(config).observer.layout:
+        raise ValueError(
+            f"{origin} observes as task {task}, not as {config.task}:"
+            " its weights do not fit (nearest variant: 'twirl')"
+        )
+
+
+def source_weights(
+    config: TrainConfig, source: Source, say: Callable[[str], None]
+) -> Callable[[DroqState], DroqState]:
+    """Return a function that writes the source's networks into a fresh learner.
+
+    A run directory gives the actor of its best policy, as it is evaluated and shipped, and the
+    critics and the temperature of its end; a policy file has only the actor.
+
+    Raises:
+        ValueError: The source has no networks, or observations, layer sizes or critics differ.
+    """
+    policy = source.numpy_policy
+    if not isinstance(policy, NumpyPolicy):
+        raise ValueError(f"{source.origin} has no network weights (nearest variant: 'twirl')")
+    check_layouts(config, policy.header.task, source.origin)
+    sizes = tuple(
+        len(policy.actor_params[name]["bias"]) for name in hidden_layers(policy.actor_params)
+    )
+    if sizes != config.droq.hidden_sizes:
+        raise ValueError(
+            f"{source.origin} has hidden layers of {sizes} units, this run"
+            f" {config.droq.hidden_sizes} (nearest: --droq.hidden-sizes"
+            f" {' '.join(map(str, sizes))})"
+        )
+    actor = jax.tree.map(jnp.asarray, dict(policy.actor_params))
+    learner = load_learner(source.run_dir) if source.run_dir else None
+    if learner is None:
+        say(f"weights: the actor of {source.origin}; a policy file has no critics")
+    else:
+        critics = jax.tree.leaves(learner["critic"])[0].shape[0]
+        if critics != config.droq.num_critics:
+            raise ValueError(
+                f"{source.origin} has {critics} critics, this run {config.droq.num_critics}"
+                f" (nearest: --droq.num-critics {critics})"
+            )
+
+    def initial(fresh: DroqState) -> DroqState:
+        if learner is None:
+            return fresh.replace(actor=actor)
+        return fresh.replace(
+            actor=actor,
+            critic=learner["critic"],
+            target_critic=learner["target_critic"],
+            log_temperature=learner["log_temperature"],
+        )
+
+    return initial
