@@ -21,6 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from twirl_mjx.training import source_rules
 from twirl_mjx.types import Transition
 
 
@@ -38,6 +39,16 @@ class TraceCounter:
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
         self.traces += 1
         return self.function(*args, **kwargs)
+
+
+@pytest.fixture
+def no_shipped_policies(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let sources be found as if ``assets/policies`` were empty."""
+
+    def missing(*parts: str) -> Path:
+        raise FileNotFoundError(parts)
+
+    monkeypatch.setattr(source_rules, "asset_path", missing)
 
 
 @pytest.fixture

@@ -15,6 +15,7 @@ from twirl_mjx.sweep import plan
 from twirl_mjx.sweep.grid import load
 
 NAMES = ("phi", "shifts", "tasks", "utd")
+pytestmark = pytest.mark.usefixtures("no_shipped_policies")
 BOTH = [(name, reduced) for name in NAMES for reduced in (False, True)]
 CELLS = {
     ("tasks", False): 2 * 2 * 3 + 2,
@@ -26,12 +27,6 @@ CELLS = {
     ("utd", False): 2 * 5 * 4 * 3,
     ("utd", True): 4 * 2,
 }
-
-
-@pytest.fixture(autouse=True)
-def _no_shipped_policies(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The plan must not depend on which policies happen to be shipped."""
-    monkeypatch.setattr(plan, "_shipped", lambda task: None)
 
 
 def test_all_grids_are_known() -> None:

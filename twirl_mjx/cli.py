@@ -11,6 +11,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from twirl_mjx import exits
 from twirl_mjx.deploy.gl import probe_gl
 
 COMMANDS = {
@@ -84,19 +85,18 @@ def main(argv: list[str] | None = None) -> int:
     """Run one command.
 
     Returns:
-        Exit status: 0 done; 1 it failed; 2 unusable arguments; 130 stopped by a signal after
-        saving; 141 nobody reads the output.
+        Exit status: 0 done, else one of ``exits``.
     """
     argv = list(sys.argv[1:] if argv is None else argv)
     if not argv or argv[0] in ("-h", "--help"):
         print(_usage(), end="")
-        return 0 if argv else 2
+        return 0 if argv else exits.UNUSABLE
     name, *rest = argv
     if name not in COMMANDS:
         nearest = difflib.get_close_matches(name, COMMANDS, 1, 0.0)[0]
         print(f"twirl: unknown command {name!r} (nearest: {nearest!r})\n", file=sys.stderr)
         print(_usage(), end="", file=sys.stderr)
-        return 2
+        return exits.UNUSABLE
     try:
         _set_environment()
         if name in DRAWING:  # these parse their options before they import the simulation
@@ -105,16 +105,16 @@ def main(argv: list[str] | None = None) -> int:
         return _import_command(name).main(rest)
     except (ValueError, FileNotFoundError) as error:
         print(f"twirl {name}: {error}", file=sys.stderr)
-        return 2
+        return exits.UNUSABLE
     except RuntimeError as error:
         print(f"twirl {name}: {error}", file=sys.stderr)
-        return 130 if type(error).__name__ == "StoppedError" else 1
+        return getattr(error, "exit_status", exits.FAILED)
     except BrokenPipeError:  # the reader of our output, `| head` say, has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 141
+        return exits.UNREAD
     except KeyboardInterrupt:
         print(f"twirl {name}: interrupted", file=sys.stderr)
-        return 130
+        return exits.STOPPED
 
 
 if __name__ == "__main__":

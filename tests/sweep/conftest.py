@@ -11,7 +11,6 @@ from typing import Any
 import pytest
 
 from twirl_mjx import config_json
-from twirl_mjx.sweep import plan
 from twirl_mjx.sweep.plan import Cell
 from twirl_mjx.sweep.worker import Ending, Job, run_job
 
@@ -81,8 +80,8 @@ def finish_run() -> Callable[..., Path]:
 
 
 @pytest.fixture(autouse=True)
-def _no_shipped_policies(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(plan, "_shipped", lambda task: None)
+def _plans_without_shipped_policies(no_shipped_policies: None) -> None:
+    """The plan must not depend on which policies happen to be shipped."""
 
 
 class HereExecutor:

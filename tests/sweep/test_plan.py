@@ -5,17 +5,15 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
 
 import pytest
 
 from twirl_mjx.commands.sweep import main, wanted
-from twirl_mjx.config import TrainConfig
 from twirl_mjx.presets import make_config
 from twirl_mjx.sweep import plan
 from twirl_mjx.sweep.grid import Draft, load
 from twirl_mjx.sweep.plan import Cell, make_plan, status_of
-from twirl_mjx.training import rundir
+from twirl_mjx.training import rundir, source_rules
 
 Finish = Callable[..., Path]
 
@@ -70,54 +68,19 @@ def test_a_cell_may_be_the_run_that_another_needs(grid_file: Path, tmp_path: Pat
     assert icy.needs == (nominal.name,)
 
 
-class TrainedError(Exception):
-    """Carries the config that the pipeline would train as the source."""
-
-
-@pytest.mark.parametrize("is_shipped", [False, True])
-@pytest.mark.parametrize("preset", ["debug", "cpu"])
-@pytest.mark.parametrize("source", ["auto", "train", "trot"])
-@pytest.mark.parametrize("options", [{}, {"clip": "own.npz"}])
-def test_sources_are_those_of_training(
-    options: dict[str, str], source: str, preset: str, is_shipped: bool,
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
-) -> None:  # fmt: skip
-    from twirl_mjx.training import pipeline
-
-    file = tmp_path / "shipped.npz"
-    file.write_bytes(b"a policy")
-
-    def asset(*parts: str) -> Path:
-        if is_shipped:
-            return file
-        raise FileNotFoundError
-
-    def train(config: TrainConfig, *_: object) -> Path:
-        raise TrainedError(config)
-
-    monkeypatch.setattr(pipeline, "asset_path", asset)
-    monkeypatch.setattr(pipeline, "run", train)
-    monkeypatch.setattr(pipeline, "_from_path", lambda config, path: path)
-    monkeypatch.setattr(pipeline, "resolve_policy", lambda name, config: Named(None, name))
-    monkeypatch.setattr(plan, "_shipped", lambda task: file if is_shipped else None)
-    plain = make_config("hurdles", preset)
-    imitate = dataclasses.replace(plain.imitate, **options)
-    config = dataclasses.replace(plain, seed=2, source=source, imitate=imitate)
-    cells = list(resolve(Draft("arm", preset, config, ()), tmp_path).values())
-    try:
-        found = pipeline.find_source(config, preset, tmp_path, print)
-    except TrainedError as needed:
-        (expected,) = needed.args
-        assert cells[-1].needs == (cells[-2].name,)
-        assert dataclasses.replace(cells[-2].config, source=expected.source) == expected
-    else:
-        assert len(cells) == 1
-        assert cells[0].source == ("auto" if found == file else found.origin)
-
-
-class Named(NamedTuple):
-    policy: None
-    origin: str
+def test_a_shipped_policy_is_known_by_its_content(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = tmp_path / "stand.npz"
+    monkeypatch.setattr(source_rules, "asset_path", lambda *_: file)
+    draft = Draft("arm", "cpu", make_config("biped", "cpu"), ())
+    identities = set()
+    for content in (b"a policy", b"another"):
+        file.write_bytes(content)
+        (cell,) = resolve(draft, tmp_path).values()
+        assert (cell.source, cell.needs) == ("auto", ())
+        identities.add(cell.config.source)
+    assert len(identities) == 2
 
 
 def test_scratch_and_scripted_need_nothing(tmp_path: Path) -> None:

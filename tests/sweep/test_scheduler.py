@@ -13,9 +13,10 @@ from typing import Any
 
 import pytest
 
+from twirl_mjx import exits
 from twirl_mjx.sweep import scheduler
 from twirl_mjx.sweep.scheduler import Progress, run_all
-from twirl_mjx.sweep.worker import BUSY, Job, claim_core, run_job
+from twirl_mjx.sweep.worker import Job, claim_core, run_job
 from twirl_mjx.training import rundir
 
 WRITE = "import pathlib, sys; pathlib.Path(sys.argv[1]).write_text('done')"
@@ -146,9 +147,8 @@ BUSY_TRAIN = (
 def test_a_run_that_another_process_holds_is_told_from_a_crash(tmp_path: Path) -> None:
     job = Job("a", ("-c", BUSY_TRAIN, str(tmp_path / "run")), str(tmp_path / "a.log"))
     with rundir.exclusive(tmp_path / "run"):
-        assert run_job(job, pin=False).code == BUSY
+        assert run_job(job, pin=False).code == exits.BUSY
     assert run_job(job, pin=False).code == 0
-    # what an earlier attempt has said in the log is not what this one says
     crash = Job("a", ("-S", "-c", FAIL), job.log)
     assert run_job(crash, pin=False).code == 1
 
@@ -180,7 +180,7 @@ def test_losing_the_race_for_a_run_is_no_attempt(
     refused_twice = (
         "import pathlib, sys; p = pathlib.Path(sys.argv[1])\n"
         "tries = p.read_text() if p.exists() else ''; p.write_text(tries + 'x')\n"
-        "len(tries) < 2 and sys.exit('twirl train: runs/a is in use by process 1 on here')"
+        f"len(tries) < 2 and sys.exit({exits.BUSY})"
     )
     executor = here_executor()
     jobs = [make(tmp_path, "a", refused_twice), make(tmp_path, "child", needs=("a",))]

@@ -12,6 +12,7 @@ from typing import Any
 
 import pytest
 
+from twirl_mjx import exits
 from twirl_mjx.sweep import scheduler
 from twirl_mjx.sweep.scheduler import Progress, run_all
 from twirl_mjx.sweep.worker import Ending, Job, run_job
@@ -41,7 +42,7 @@ class SlowExecutor:
         return list(handles) if self.looks <= 0 else []
 
     def ending(self, handle: Job) -> Ending:
-        return Ending(scheduler.STOPPED, "here")
+        return Ending(exits.STOPPED, "here")
 
     def stop(self, handle: Job) -> None:
         self.said.append("stop")

@@ -16,11 +16,10 @@ from pathlib import Path
 from typing import Literal
 
 from twirl_mjx import config_json
-from twirl_mjx.assets import asset_path
-from twirl_mjx.config import SCRIPTED_SOURCES, TrainConfig
-from twirl_mjx.presets import make_config, source_task_of, starts_from_nominal_run
+from twirl_mjx.config import TrainConfig
+from twirl_mjx.presets import make_config
 from twirl_mjx.sweep.grid import Draft, Grid, configure
-from twirl_mjx.training import rundir
+from twirl_mjx.training import rundir, source_rules
 
 EVAL_CSV = "eval.csv"
 METRICS_CSV = "metrics.csv"
@@ -121,34 +120,21 @@ def resolve(draft: Draft, runs: Path, given: Mapping[str, Path], cells: dict[str
 def _source_of(
     draft: Draft, runs: Path, given: Mapping[str, Path], cells: dict[str, Cell]
 ) -> tuple[str, str, tuple[str, ...]]:
-    """Return what the source is, where it lies, and the names of the runs needed for it.
-
-    The rules are those of ``training.pipeline.find_source``, which cannot be asked, as it trains
-    what is missing; a test compares the two.
-    """
+    """Return what the source is, where it lies, and the names of the runs needed for it."""
     config = draft.config
     if config.variant == "scratch":
         return "auto", "auto", ()
-    adapts = starts_from_nominal_run(config, draft.preset)
-    if config.source in SCRIPTED_SOURCES and not adapts:
-        return config.source, config.source, ()
-    if config.source not in ("auto", "train", *SCRIPTED_SOURCES):
-        path = Path(config.source)
-        return _identity_of_path(path), str(path.resolve()), ()
-    if adapts:
-        if config.task in given:
-            path = given[config.task]
+    match source_rules.source_of(config, draft.preset):
+        case source_rules.Scripted(name):
+            return name, name, ()
+        case source_rules.AtPath(path, is_shipped):
+            return _identity_of_path(path), "auto" if is_shipped else str(path.resolve()), ()
+        case source_rules.NominalRun() if path := given.get(config.task):
             return _identity_of_path(path), str(path.resolve()), ()
-        return _needed(_nominal_draft(draft), runs, given, cells)
-    task = source_task_of(config)
-    plain = make_config(task, draft.preset)
-    options = getattr(config, task)
-    if config.source == "auto" and draft.preset != "debug" and options == getattr(plain, task):
-        shipped = _shipped(task)
-        if shipped is not None:
-            return _identity_of_path(shipped), "auto", ()
-    first = dataclasses.replace(plain, seed=config.seed, **{task: options})
-    return _needed(Draft("", draft.preset, first, ()), runs, given, cells)
+        case source_rules.NominalRun():
+            return _needed(_nominal_draft(draft), runs, given, cells)
+        case source_rules.RunOf(first):
+            return _needed(Draft("", draft.preset, first, ()), runs, given, cells)
 
 
 def _needed(
@@ -179,13 +165,6 @@ def _adoptable(draft: Draft, runs: Path) -> str | None:
     free = tuple(set(rundir.may_change(same)) - {"total_env_steps", "source"})
     differs = [line for line in config_json.diff(found, same) if not line.startswith(free)]
     return None if differs else run_dir.name
-
-
-def _shipped(task: str) -> Path | None:
-    try:
-        return asset_path("policies", f"{task}.npz")
-    except FileNotFoundError:
-        return None
 
 
 def _identity_of_path(path: Path) -> str:

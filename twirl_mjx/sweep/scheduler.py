@@ -11,8 +11,9 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Literal, Protocol
 
+from twirl_mjx import exits
 from twirl_mjx.sweep.plan import Status
-from twirl_mjx.sweep.worker import BUSY, Ending, Job, run_job
+from twirl_mjx.sweep.worker import Ending, Job, run_job
 
 State = Literal["waiting", "running", "busy", "done", "failed", "blocked", "stopped"]
 """``busy``: another process works on the run, which is waited for."""
@@ -21,10 +22,6 @@ OBJECT_STORE_BYTES = 80 * 2**20
 """Ray's smallest object store; jobs hand over a few words."""
 START_ATTEMPTS = 4
 """Attempts to start Ray."""
-NO_RETRY = 2
-"""Exit status of unusable arguments: another attempt would end the same way."""
-STOPPED = 130
-"""Exit status of a run that was asked to stop and saved itself."""
 BUSY_LOOK_S = 10.0
 """Time between two looks at a run that another process works on, s."""
 
@@ -285,12 +282,12 @@ def _settle(progress: Progress, handle: Any, executor: Executor, retries: int) -
         progress.reason = _reason(code)
     if code == 0:
         progress.state = "done"
-    elif code == BUSY:
+    elif code == exits.BUSY:
         progress.attempts -= 1
         _set_busy(progress)
-    elif code == STOPPED:
+    elif code == exits.STOPPED:
         progress.state = "stopped"
-    elif code != NO_RETRY and progress.attempts <= retries:
+    elif code != exits.UNUSABLE and progress.attempts <= retries:
         progress.state = "waiting"
     else:
         progress.state = "failed"

@@ -19,12 +19,6 @@ from twirl_mjx.sweep import launch
 
 POLL_S = 0.5
 """Time between two looks at a child, s; Ray interrupts a worker between two instructions only."""
-FAILED = 1
-"""Exit status of a run that failed, also because another process holds its directory."""
-BUSY = 75
-"""Code of an ending of the latter kind: temporary, and no fault of the run (sysexits.h)."""
-BUSY_TEXT = " is in use by "
-"""What a run says then (``training.rundir.RunBusyError``)."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,7 +40,7 @@ class Ending:
     """How one attempt ended."""
 
     code: int
-    """Exit status of the process, or ``BUSY``; negative: killed by that signal."""
+    """Exit status of the process, see ``exits``; negative: killed by that signal."""
     where: str
     """Machine and core."""
 
@@ -94,7 +88,6 @@ def run_job(job: Job, *, pin: bool = True) -> Ending:
         stamp = time.strftime("%Y-%m-%d %H:%M:%S")
         file.write(f"== {stamp} on {place}: {' '.join(job.argv)}\n")
         file.flush()
-        start = file.tell()
         target = "-" if core is None else str(core)
         command = [sys.executable, "-S", launch.__file__, str(os.getpid()), target]
         child = subprocess.Popen(
@@ -111,7 +104,7 @@ def run_job(job: Job, *, pin: bool = True) -> Ending:
                 child.kill()
                 child.wait()
         file.write(f"== ended with {code}\n")
-    return Ending(BUSY if code == FAILED and _was_refused(log, start) else code, place)
+    return Ending(code, place)
 
 
 def _wait(child: subprocess.Popen[bytes]) -> int:
@@ -126,10 +119,3 @@ def _exit_status(child: subprocess.Popen[bytes]) -> int:
     while (code := child.poll()) is None:
         time.sleep(POLL_S)
     return code
-
-
-def _was_refused(log: Path, start: int) -> bool:
-    """Return whether a run said after byte ``start`` of its log that another process holds it."""
-    with log.open("rb") as file:
-        file.seek(start)
-        return BUSY_TEXT.encode() in file.read()

@@ -18,16 +18,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from twirl_mjx import config_json
-from twirl_mjx.assets import asset_path
-from twirl_mjx.config import SCRIPTED_SOURCES, TrainConfig
+from twirl_mjx import config_json, exits
+from twirl_mjx.config import TrainConfig
 from twirl_mjx.droq.state import DroqState
 from twirl_mjx.policies.resolve import resolve_policy
-from twirl_mjx.presets import make_config, source_task_of, starts_from_nominal_run
+from twirl_mjx.presets import make_config
 from twirl_mjx.replay import dataset, ring
 from twirl_mjx.tasks.imitate import load_clip
 from twirl_mjx.tasks.registry import make_env
-from twirl_mjx.training import loop, rundir
+from twirl_mjx.training import loop, rundir, source_rules
 from twirl_mjx.training.checkpoint import load_replay
 from twirl_mjx.training.source import Source, collect
 from twirl_mjx.training.weights import check_weights_fit, source_weights
@@ -37,6 +36,8 @@ Say = Callable[[str], None]
 
 class StoppedError(RuntimeError):
     """A stage was stopped by a signal; the same command resumes."""
+
+    exit_status = exits.STOPPED
 
 
 def run(config: TrainConfig, preset: str, runs_dir: Path, name: str | None, say: Say) -> Path:
@@ -102,41 +103,27 @@ def _train(
 
 
 def find_source(config: TrainConfig, preset: str, runs_dir: Path, say: Say) -> Source:
-    """Return the source policy of a run, training it first when there is none.
-
-    ``config.source`` is ``auto`` (the policy shipped in ``assets/policies``, else a run of the
-    source task, else train one), ``train``, the name of a scripted policy, or a path. The source's
-    own run has the same preset and seed, and may need a source itself.
+    """Return the source of a run (``source_rules`` says which), training it when it is missing.
 
     Raises:
         StoppedError: Training the source was stopped.
         FileNotFoundError: A path that does not exist, or no finished nominal run under a shift.
+        ValueError: The task has no source of its own and none is named.
     """
-    wanted = config.source
-    if starts_from_nominal_run(config, preset):
-        return _nominal_run(config, preset, runs_dir)
-    if wanted in SCRIPTED_SOURCES:
-        found = resolve_policy(wanted, config)
-        return Source(found.policy, found.origin, scripted_digest(config))
-    if wanted not in ("auto", "train"):
-        return _from_path(config, Path(wanted))
-    source_task = source_task_of(config)
-    source_config = dataclasses.replace(make_config(source_task, preset), seed=config.seed)
-    options = getattr(config, source_task)
-    as_shipped = options == getattr(source_config, source_task)
-    shipped = f"policies/{source_task}.npz"
-    if wanted == "auto" and preset != "debug" and as_shipped:
-        try:
-            path = asset_path(*shipped.split("/"))
-        except FileNotFoundError:
-            say(f"no shipped {source_task} policy: training one first")
-        else:
-            say(f"source: the shipped policy assets/{shipped} (--source train trains your own)")
+    match source_rules.source_of(config, preset):
+        case source_rules.NominalRun():
+            return _nominal_run(config, preset, runs_dir)
+        case source_rules.Scripted(name):
+            found = resolve_policy(name, config)
+            return Source(found.policy, found.origin, scripted_digest(config))
+        case source_rules.AtPath(path, is_shipped):
+            if is_shipped:
+                say(f"source: the shipped policy {path.name} (--source train trains your own)")
             return _from_path(config, path)
-    source_config = dataclasses.replace(source_config, **{source_task: options})
-    source_dir = runs_dir / rundir.default_name(source_config, preset)
-    say(f"stage 1 of 3: source policy, task {source_task}, in {source_dir}")
-    return _from_path(config, run(source_config, preset, runs_dir, None, say))
+        case source_rules.RunOf(first):
+            run_dir = runs_dir / rundir.default_name(first, preset)
+            say(f"stage 1 of 3: source policy, task {first.task}, in {run_dir}")
+            return _from_path(config, run(first, preset, runs_dir, None, say))
 
 
 def scripted_digest(config: TrainConfig) -> str:

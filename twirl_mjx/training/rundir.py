@@ -15,7 +15,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-from twirl_mjx import config_json
+from twirl_mjx import config_json, exits
 from twirl_mjx.config import TASKS, TrainConfig
 
 CONFIG_NAME = "config.json"
@@ -40,6 +40,8 @@ class RunMismatchError(ValueError):
 
 class RunBusyError(RuntimeError):
     """A run directory that another process is working on."""
+
+    exit_status = exits.BUSY
 
 
 @contextlib.contextmanager

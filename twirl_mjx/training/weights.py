@@ -11,10 +11,11 @@ import jax.numpy as jnp
 from twirl_mjx.config import TrainConfig
 from twirl_mjx.droq.state import DroqState
 from twirl_mjx.policies.learned import NumpyPolicy, hidden_layers
-from twirl_mjx.presets import source_task_of, starts_from_nominal_run
+from twirl_mjx.presets import source_task_of
 from twirl_mjx.tasks.registry import make_task
 from twirl_mjx.training.checkpoint import load_learner
 from twirl_mjx.training.source import Source
+from twirl_mjx.training.source_rules import AtPath, RunOf, source_of
 
 
 def check_weights_fit(config: TrainConfig, preset: str) -> None:
@@ -23,10 +24,12 @@ def check_weights_fit(config: TrainConfig, preset: str) -> None:
     Raises:
         ValueError: The default source observes differently.
     """
-    by_default = config.source in ("auto", "train") and not starts_from_nominal_run(config, preset)
-    if config.uses_source_weights and by_default:
-        task = source_task_of(config)
-        check_layouts(config, task, f"the source task {task}")
+    if not config.uses_source_weights:
+        return
+    match source_of(config, preset):
+        case AtPath(is_shipped=True) | RunOf():
+            task = source_task_of(config)
+            check_layouts(config, task, f"the source task {task}")
 
 
 def check_layouts(config: TrainConfig, task: str, origin: str) -> None:

@@ -1,0 +1,69 @@
+"""Which source a run starts from, decided by its config alone: nothing is opened or trained.
+
+The pipeline acts on the answer, and a sweep plans with it what has to be run first.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+from twirl_mjx.assets import asset_path
+from twirl_mjx.config import SCRIPTED_SOURCES, TrainConfig
+from twirl_mjx.presets import make_config, source_task_of, starts_from_nominal_run
+
+
+@dataclasses.dataclass(frozen=True)
+class NominalRun:
+    """The finished run of the same task without the shift; its replay is the source data."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Scripted:
+    """A scripted controller."""
+
+    name: str
+
+
+@dataclasses.dataclass(frozen=True)
+class AtPath:
+    """A policy file or a run directory that exists, or should."""
+
+    path: Path
+    is_shipped: bool = False
+    """Whether it is the policy of the source task in ``assets/policies``."""
+
+
+@dataclasses.dataclass(frozen=True)
+class RunOf:
+    """A run of the source task, trained first when it is missing."""
+
+    config: TrainConfig
+
+
+def source_of(config: TrainConfig, preset: str) -> NominalRun | Scripted | AtPath | RunOf:
+    """Return the source of a run that has one.
+
+    ``config.source`` is ``auto`` (the shipped policy, else a run of the source task), ``train``
+    (such a run always), the name of a scripted controller, or a path. Shipped policies are of no
+    use to the preset ``debug``, whose networks are smaller, or with other options of the source
+    task. The source's own run has the same preset and seed, and may have a source itself.
+
+    Raises:
+        ValueError: The task has no source of its own and none is named.
+    """
+    if starts_from_nominal_run(config, preset):
+        return NominalRun()
+    if config.source in SCRIPTED_SOURCES:
+        return Scripted(config.source)
+    if config.source not in ("auto", "train"):
+        return AtPath(Path(config.source))
+    task = source_task_of(config)
+    plain = make_config(task, preset)
+    options = getattr(config, task)
+    if config.source == "auto" and preset != "debug" and options == getattr(plain, task):
+        try:
+            return AtPath(asset_path("policies", f"{task}.npz"), is_shipped=True)
+        except FileNotFoundError:
+            pass
+    return RunOf(dataclasses.replace(plain, seed=config.seed, **{task: options}))
