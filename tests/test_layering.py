@@ -14,12 +14,13 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = "twirl_mjx"
 
-BASE = {"types", "checks", "config", "presets", "config_json", "assets"}
+BASE = {"types", "checks", "exits", "config", "presets", "config_json", "assets"}
 WORLD = BASE | {"sim", "motion"}
 ACTING = WORLD | {"tasks", "droq", "policies"}
 ALLOWED: dict[str, set[str]] = {
     "types": set(),
     "checks": set(),
+    "exits": set(),
     "assets": set(),
     "config": {"types", "checks"},
     "presets": {"checks", "config"},
