@@ -49,6 +49,10 @@ def test_unknown_command_suggests_the_nearest(capsys: pytest.CaptureFixture[str]
         (["evaluate", "trot", "--task", "biped", "--goal-distance", "0"], "nearest: 0.01"),
         (["evaluate", "trot", "--task", "hurdles", "--hurdle-gap", "1"], "nearest: 1.4"),
         (["evaluate", "trot", "--task", "stand", "--hurdle-gap", "2"], "option of task hurdles"),
+        (
+            ["evaluate", "trot", "--task", "stand", "--hurdle-gaps", "2", "3"],
+            "option of task hurdles",
+        ),
     ],
 )
 def test_bad_input_is_refused_before_anything_is_written(

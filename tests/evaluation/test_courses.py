@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax
 import numpy as np
 import pytest
@@ -44,3 +46,18 @@ def test_random_hurdles_are_those_of_training() -> None:
     assert gaps.min() >= 1.6 - 1e-4
     assert gaps.max() <= 2.6 + 1e-4
     assert np.ptp(gaps) > 0.5
+
+
+def test_random_hurdles_of_other_gaps() -> None:
+    options = EvaluateOptions((), course="random", hurdle_gaps=(2.8, 3.6))
+    gaps = np.diff(bands(options), axis=1)
+    assert gaps.min() >= 2.8 - 1e-4
+    assert gaps.max() <= 3.6 + 1e-4
+    assert np.ptp(gaps) > 0.4
+
+
+@pytest.mark.parametrize("changes", [{"course": "fixed"}, {"hurdle_gap": 2.0}])
+def test_random_gaps_need_the_random_course(changes: dict[str, Any]) -> None:
+    options = EvaluateOptions((), **{"course": "random", "hurdle_gaps": (1.6, 2.6), **changes})
+    with pytest.raises(ValueError, match=r"hurdle_gaps 1.6 2.6 .*nearest: add --course random"):
+        on_course(make_config("hurdles"), options)

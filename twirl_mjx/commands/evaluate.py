@@ -47,6 +47,9 @@ class EvaluateOptions:
     """m, distance of every goal of ``biped``; that of the policy's config by default."""
     hurdle_gap: float | None = None
     """m, gap between all hurdles of ``hurdles``; that of the policy's config by default."""
+    hurdle_gaps: tuple[float, float] | None = None
+    """m, smallest and largest gap on the random course of ``hurdles``; those of the policy's config
+    by default."""
     engine: Literal["auto", "mjx", "native"] = "auto"
     """Physics engine: MJX, or C MuJoCo in threads; auto as in training."""
     episodes: int = 100
@@ -128,7 +131,8 @@ def on_course(config: TrainConfig, options: EvaluateOptions) -> TrainConfig:
     Raises:
         ValueError: A distance out of range, or of another task.
     """
-    for task, name in (("biped", "goal_distance"), ("hurdles", "hurdle_gap")):
+    of_task = {"goal_distance": "biped", "hurdle_gap": "hurdles", "hurdle_gaps": "hurdles"}
+    for name, task in of_task.items():
         if getattr(options, name) is not None and config.task != task:
             raise ValueError(f"{name} is an option of task {task}, not of {config.task}")
     biped, hurdles = config.biped, config.hurdles
@@ -140,6 +144,13 @@ def on_course(config: TrainConfig, options: EvaluateOptions) -> TrainConfig:
     if (gap := options.hurdle_gap) is not None:
         check_range("hurdle_gap", gap, MIN_GAP, 100.0)
         hurdles = dataclasses.replace(hurdles, fixed_gap=gap, min_gap=gap, max_gap=gap)
+    if (gaps := options.hurdle_gaps) is not None:
+        if options.course != "random" or options.hurdle_gap is not None:
+            raise ValueError(
+                f"hurdle_gaps {gaps[0]} {gaps[1]} are drawn on the random course only"
+                " (nearest: add --course random, and leave --hurdle-gap out)"
+            )
+        hurdles = dataclasses.replace(hurdles, min_gap=gaps[0], max_gap=gaps[1])
     env = dataclasses.replace(config.env, course=options.course, engine=options.engine)
     return dataclasses.replace(config, biped=biped, hurdles=hurdles, env=env)
 
