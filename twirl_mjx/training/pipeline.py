@@ -118,7 +118,8 @@ def find_source(config: TrainConfig, preset: str, runs_dir: Path, say: Say) -> S
             return Source(found.policy, found.origin, scripted_digest(config))
         case source_rules.AtPath(path, is_shipped):
             if is_shipped:
-                say(f"source: the shipped policy assets/policies/{path.name} (--source train: your own)")
+                shown = f"assets/policies/{path.name}"
+                say(f"source: the shipped policy {shown} (--source train trains your own)")
             return _from_path(config, path)
         case source_rules.RunOf(first):
             run_dir = runs_dir / rundir.default_name(first, preset)
