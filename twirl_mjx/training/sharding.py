@@ -58,7 +58,7 @@ def compile_epoch_seeds(config: TrainConfig, env: VectorEnv, mesh: Mesh) -> Epoc
         out_specs=(specs, PartitionSpec(SEEDS)),
         check_vma=False,  # that env_steps stays equal on all devices is ours to know
     )
-    return jax.jit(epoch, donate_argnums=0)
+    return _jit_on_mesh(epoch, _named(specs, mesh), NamedSharding(mesh, PartitionSpec(SEEDS)))
 
 
 def shard_worlds(state: TrainState, mesh: Mesh) -> TrainState:
@@ -82,14 +82,8 @@ def compile_epoch_worlds(config: TrainConfig, env: VectorEnv, mesh: Mesh) -> Epo
     Raises:
         ValueError: The number of worlds is not a multiple of the number of devices.
     """
-    state = _named(_world_specs(), mesh)
     epoch = functools.partial(train_epoch, config, ShardedEnv(env, mesh))
-    return jax.jit(
-        epoch,
-        in_shardings=(state,),
-        out_shardings=(state, NamedSharding(mesh, _EVERYWHERE)),
-        donate_argnums=0,
-    )
+    return _jit_on_mesh(epoch, _named(_world_specs(), mesh), NamedSharding(mesh, _EVERYWHERE))
 
 
 class ShardedEnv(VectorEnv):
@@ -155,6 +149,11 @@ def _named(specs: Any, mesh: Mesh) -> Any:
         specs,
         is_leaf=lambda node: isinstance(node, PartitionSpec),
     )
+
+
+def _jit_on_mesh(epoch: Epoch, state: Any, metrics: NamedSharding) -> Epoch:
+    """Compile an epoch; without a fixed place for its results a second call compiles anew."""
+    return jax.jit(epoch, in_shardings=(state,), out_shardings=(state, metrics), donate_argnums=0)
 
 
 def _check_even(what: str, number: int, mesh: Mesh) -> None:
