@@ -16,6 +16,7 @@ from twirl_mjx.config import (
     BipedConfig,
     DroqConfig,
     EnvConfig,
+    EvalConfig,
     HurdlesConfig,
     ImitateConfig,
     ReplayConfig,
@@ -81,6 +82,13 @@ def test_updates_that_do_not_divide_are_refused_with_the_numbers() -> None:
         TrainConfig(droq=DroqConfig(utd=1.25, updates_per_block=16))
     with pytest.raises(ValueError, match="whole number"):
         TrainConfig(env=EnvConfig(num_envs=1), droq=DroqConfig(utd=0.5, updates_per_block=1))
+
+
+def test_the_nearest_utd_is_accepted() -> None:
+    env = EnvConfig(num_envs=48)
+    with pytest.raises(ValueError, match=r"nearest: utd 0\.416667\)"):
+        TrainConfig(env=env, droq=DroqConfig(utd=0.4))
+    assert TrainConfig(env=env, droq=DroqConfig(utd=0.416667)).updates_per_step == 20
 
 
 def test_variants_decide_phi() -> None:
@@ -168,7 +176,15 @@ def test_diff_names_every_field_that_differs() -> None:
         (lambda: ImitateConfig(max_root_error=0.0), "max_root_error = 0.0 is outside"),
         (lambda: ImitateConfig(standing_fraction=1.5), "standing_fraction = 1.5 is outside"),
         (lambda: HurdlesConfig(hurdle_bonus="evnt"), "nearest: 'event'"),  # type: ignore[arg-type]
-        (lambda: TrainConfig(total_env_steps=2**31), "total_env_steps = 2147483648 is outside"),
+        (
+            lambda: TrainConfig(total_env_steps=110_000_000),
+            r"total_env_steps = 110000000 is outside \[1, 107372182\]",  # UTD 20: counts in int32
+        ),
+        (lambda: TrainConfig(warmup_env_steps=2**31), "warmup_env_steps = 2147483648 is outside"),
+        (lambda: BipedConfig(fixed_goal=(float("nan"), 0.0)), "fixed_goal = nan is outside"),
+        (lambda: HurdlesConfig(max_gap=float("inf")), "max_gap = inf is outside"),
+        (lambda: DroqConfig(target_entropy=float("-inf")), "target_entropy = -inf is outside"),
+        (lambda: EvalConfig(seed=2**32), "eval.seed = 4294967296 is outside"),
     ],
 )
 def test_task_options_are_checked(build: Callable[[], object], match: str) -> None:

@@ -27,3 +27,19 @@ def check_range(what: str, value: float, low: float, high: float) -> None:
     if not low <= value <= high:
         nearest = low if not value > low else high
         raise ValueError(f"{what} = {value} is outside [{low}, {high}] (nearest: {nearest})")
+
+
+def check_updates(utd: float, num_envs: int, updates_per_block: int) -> None:
+    """Check that UTD gives whole blocks of critic updates per vector step, rounding apart.
+
+    Raises:
+        ValueError: With the numbers, and the nearest ``utd`` that divides.
+    """
+    updates = utd * num_envs
+    blocks = max(1, round(updates / updates_per_block))
+    if abs(updates - blocks * updates_per_block) > 1e-5 * updates:
+        raise ValueError(
+            f"droq.utd {utd:g} x env.num_envs {num_envs} = {updates:g} critic updates per"
+            f" vector step, which is not a whole number of blocks of droq.updates_per_block"
+            f" {updates_per_block} (nearest: utd {blocks * updates_per_block / num_envs:g})"
+        )

@@ -8,7 +8,7 @@ from __future__ import annotations
 import dataclasses
 from typing import Literal
 
-from twirl_mjx.checks import check_choice, check_range
+from twirl_mjx.checks import check_choice, check_range, check_updates
 
 Variant = Literal["scratch", "twirl", "twirl+weights", "weights", "zero-shot"]
 VARIANTS: tuple[Variant, ...] = ("scratch", "twirl", "twirl+weights", "weights", "zero-shot")
@@ -16,6 +16,8 @@ TASKS = ("stand", "biped", "imitate", "hurdles")
 SHIFTS = ("none", "bumpy", "icy", "weakened", "sloped", "gravity")
 SOURCE_OF = {"biped": "stand", "hurdles": "imitate"}
 """Task whose trained policy is the default source of another task."""
+INT32_MAX = 2**31 - 1
+"""Transitions and critic updates are counted on the device, in int32."""
 SCRIPTED_SOURCES = ("trot", "bound", "zero", "random", "clip")
 """Sources nobody trained, by name; ``clip`` plays the actions planned for ``imitate.clip``."""
 
@@ -66,6 +68,8 @@ class DroqConfig:
         check_range("droq.utd", self.utd, 1e-6, 1000.0)
         check_range("droq.updates_per_block", self.updates_per_block, 1, 100_000)
         check_range("droq.initial_temperature", self.initial_temperature, 1e-6, 100.0)
+        if self.target_entropy is not None:
+            check_range("droq.target_entropy", self.target_entropy, -1e4, 1e4)
         check_choice("droq.matmul_dtype", self.matmul_dtype, ("float32", "bfloat16"))
         if not self.hidden_sizes or min(self.hidden_sizes) < 1:
             raise ValueError(f"droq.hidden_sizes = {self.hidden_sizes} needs sizes >= 1")
@@ -139,6 +143,8 @@ class BipedConfig:
         check_range("biped.goal_mean_radius", self.goal_mean_radius, 0.0, 100.0)
         check_range("biped.goal_max_radius", self.goal_max_radius, 0.0, 100.0)
         check_range("biped.goal_min_radius", self.goal_min_radius, 0.0, self.goal_max_radius)
+        for coordinate in self.fixed_goal:
+            check_range("biped.fixed_goal", coordinate, -100.0, 100.0)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -176,8 +182,10 @@ class HurdlesConfig:
     number passed in a single flight so far at every step."""
 
     def __post_init__(self) -> None:
-        """Check the bonus (the task checks the gaps), or raise ValueError."""
+        """Check the options (the task has a stricter check of the gaps), or raise ValueError."""
         check_choice("hurdles.hurdle_bonus", self.hurdle_bonus, ("count", "event", "clean"))
+        for name in ("min_gap", "max_gap", "fixed_gap"):
+            check_range(f"hurdles.{name}", getattr(self, name), 0.0, 1000.0)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -231,6 +239,7 @@ class EvalConfig:
         check_range("eval.every", self.every, 1, 10**12)
         check_range("eval.episodes", self.episodes, 1, 1_000_000)
         check_range("eval.final_episodes", self.final_episodes, 1, 1_000_000)
+        check_range("eval.seed", self.seed, 0, 2**32 - 2)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -285,11 +294,13 @@ class TrainConfig:
         check_choice("variant", self.variant, VARIANTS)
         check_range("shift_strength", self.shift_strength, 0.0, 2.0)
         check_range("seed", self.seed, 0, 2**32 - 1)  # 2**32 would be seed 0 again
-        check_range("total_env_steps", self.total_env_steps, 1, 2**31 - 1)  # counted in int32
-        check_range("warmup_env_steps", self.warmup_env_steps, 0, 10**12)
+        check_range("warmup_env_steps", self.warmup_env_steps, 0, INT32_MAX)
         check_range("epoch_env_steps", self.epoch_env_steps, 1, 10**9)
         check_range("checkpoint_minutes", self.checkpoint_minutes, 0.0, 1e6)
-        check_updates(self.droq, self.env.num_envs)
+        check_updates(self.droq.utd, self.env.num_envs, self.droq.updates_per_block)
+        per_epoch = self.steps_per_epoch * self.env.num_envs
+        fits = INT32_MAX // max(1.0, self.droq.utd) - per_epoch
+        check_range("total_env_steps", self.total_env_steps, 1, int(fits))
         if self.replay.capacity < self.env.num_envs:
             raise ValueError(
                 f"replay.capacity {self.replay.capacity} is below env.num_envs {self.env.num_envs}"
@@ -331,20 +342,3 @@ class TrainConfig:
         if self.env.course == "auto":
             return self.shift != "none"
         return self.env.course == "fixed"
-
-
-def check_updates(droq: DroqConfig, num_envs: int) -> None:
-    """Check that UTD gives whole blocks of updates per vector step.
-
-    Raises:
-        ValueError: With the numbers, and the nearest ``utd`` that divides.
-    """
-    updates = droq.utd * num_envs
-    block = droq.updates_per_block
-    blocks = max(1, round(updates / block))
-    if abs(updates - blocks * block) > 1e-6:
-        raise ValueError(
-            f"droq.utd {droq.utd:g} x env.num_envs {num_envs} = {updates:g} critic updates per"
-            f" vector step, which is not a whole number of blocks of droq.updates_per_block"
-            f" {block} (nearest: utd {blocks * block / num_envs:g})"
-        )

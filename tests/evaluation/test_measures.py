@@ -45,7 +45,12 @@ def test_biped_measures_by_hand() -> None:
     after = measures.tracker_reset("biped", tracker, jnp.array([True, False]))
     values = measures.tracker_read("biped", after)
     np.testing.assert_allclose(values["return"], [0.0, 2.5])
-    assert float(values["min_distance"][0]) == np.inf
+    assert np.isnan(values["min_distance"][0]), "no step, no minimum"
+
+
+def test_means_are_over_the_episodes_that_have_a_measure() -> None:
+    values = {"a": np.array([1.0, np.nan, 3.0]), "b": np.array([np.nan, np.nan, np.nan])}
+    assert measures.episode_means(values) == {"a": 2.0}
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import twirl_mjx
-from twirl_mjx.config import EnvConfig, StandConfig, TrainConfig
+from twirl_mjx.config import DroqConfig, EnvConfig, StandConfig, TrainConfig
 from twirl_mjx.sim.dynamics import SHIFTS, make_dynamics
 from twirl_mjx.tasks.registry import TASKS, make
 from twirl_mjx.tasks.vector import EnvState
@@ -108,6 +108,18 @@ def test_options_reach_the_worlds() -> None:
     assert env.episode_length == 7
     np.testing.assert_allclose(env.dynamics.friction, [0.7] * 5)
     assert env.task.name == "stand"
+
+
+def test_a_config_gives_what_is_not_an_argument() -> None:
+    config = TrainConfig(
+        shift="icy", env=EnvConfig(num_envs=4, engine="mjx"), droq=DroqConfig(utd=5)
+    )
+    env = make("stand", config=config)
+    np.testing.assert_allclose(env.dynamics.friction, [0.4] * 4)
+    assert type(env.engine).__name__ == "MjxEngine"
+    env = make("stand", "none", 2, engine="native", config=config)
+    np.testing.assert_allclose(env.dynamics.friction, [1.0] * 2)
+    assert type(env.engine).__name__ == "NativeEngine"
 
 
 @pytest.mark.parametrize(

@@ -5,8 +5,10 @@ from __future__ import annotations
 import csv
 import dataclasses
 import json
+import shutil
 import threading
 from pathlib import Path
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -107,15 +109,43 @@ def test_stored_experience_and_networks_can_be_read_alone(
     jax.tree.map(np.testing.assert_array_equal, stored["critic"], final.learner.critic)
 
 
+@pytest.mark.parametrize("capacity", [40, 20])
 def test_stored_experience_is_what_the_ring_still_holds(
-    stand_config: TrainConfig, tmp_path: Path
+    capacity: int, stand_config: TrainConfig, tmp_path: Path
 ) -> None:
-    small = dataclasses.replace(stand_config.replay, capacity=40)
+    """20: the ring goes round between two checkpoints, so the log has gaps."""
+    small = dataclasses.replace(stand_config.replay, capacity=capacity)
     config = dataclasses.replace(stand_config, replay=small, checkpoint_minutes=0.0)
     loop.train(config, tmp_path / "small")  # a checkpoint every epoch: the log holds more rows
     ring_rows = np.asarray(final_state(config, tmp_path / "small").replay.online.rows)
-    oldest = 96 % 40
+    oldest = 96 % capacity
     np.testing.assert_array_equal(load_replay(tmp_path / "small"), np.roll(ring_rows, -oldest, 0))
+
+
+def test_a_hole_in_the_stored_experience_is_named(whole_run: Path, tmp_path: Path) -> None:
+    shutil.copytree(whole_run, tmp_path / "run")
+    min((tmp_path / "run" / "checkpoints" / "replay").iterdir()).unlink()
+    with pytest.raises(ValueError, match="lacks row 0 of 0 to 95"):
+        load_replay(tmp_path / "run")
+
+
+def test_a_finished_run_without_checkpoints_is_not_trained_anew(
+    stand_config: TrainConfig, whole_run: Path, tmp_path: Path
+) -> None:
+    run_dir = tmp_path / "run"
+    shutil.copytree(whole_run, run_dir, ignore=shutil.ignore_patterns("checkpoints"))
+    assert loop.train(stand_config, run_dir).finished
+    before = {path: path.read_bytes() for path in run_dir.iterdir() if path.is_file()}
+    longer = dataclasses.replace(stand_config, total_env_steps=128)
+    with pytest.raises(rundir.RunMismatchError, match=r"finished at 96 .* checkpoints are gone"):
+        loop.train(longer, run_dir)
+    assert before == {path: path.read_bytes() for path in run_dir.iterdir() if path.is_file()}
+
+
+def test_worlds_that_only_diverge_stop_the_run() -> None:
+    counts = SimpleNamespace(inserted=jnp.int32(0), env_steps=jnp.int32(64))
+    with pytest.raises(loop.DivergedError, match="none of 64 transitions was finite"):
+        loop.check_experience(counts)  # type: ignore[arg-type]
 
 
 def test_finished_run_is_left_alone(stand_config: TrainConfig, whole_run: Path) -> None:

@@ -134,6 +134,15 @@ def test_fresh_run_starts_the_file_anew(tmp_path: Path) -> None:
     assert [row["value"] for row in read_rows(tmp_path) if row["metric"] == "q_mean"] == ["2"]
 
 
+def test_a_run_stopped_before_its_first_epoch_keeps_its_rows(tmp_path: Path) -> None:
+    with make_logger(tmp_path) as logger:
+        logger.log(0, 0, {"eval/return": 7.0})
+    with make_logger(tmp_path, resume_env_steps=0) as logger:
+        logger.log(10, 0, {"q_mean": 1.0})
+    assert values_of(tmp_path, "eval/return") == [7.0]
+    assert values_of(tmp_path, "q_mean") == [1.0]
+
+
 def test_foreign_csv_is_refused(tmp_path: Path) -> None:
     (tmp_path / "metrics.csv").write_text("a,b\n1,2\n")
     with pytest.raises(ValueError, match=r"has columns \['a', 'b'\]"):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import dataclasses
+import shutil
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -185,6 +186,35 @@ def test_weights_act_and_are_measured_from_the_first_step(biped: TrainConfig, ru
     assert np.abs(action - mean).mean() < chance
 
 
+def test_what_needs_no_source_is_refused_before_one_is_sought(
+    biped: TrainConfig, runs: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def seek(*_: object) -> None:
+        raise AssertionError("a source was sought")
+
+    monkeypatch.setattr(pipeline, "find_source", seek)
+    trot = dataclasses.replace(biped, source="trot")
+    other = dataclasses.replace(trot, droq=dataclasses.replace(biped.droq, tau=0.1))
+    with pytest.raises(rundir.RunMismatchError, match="tau"):
+        pipeline.run(other, "debug", runs, None, print)
+    monkeypatch.setattr(rundir, "owner", lambda run_dir: "process 1 on mars")
+    with pytest.raises(rundir.RunBusyError, match="in use by process 1 on mars"):
+        pipeline.run(trot, "debug", runs, None, print)
+
+
+def test_a_finished_run_outlives_its_source(biped: TrainConfig, runs: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "runs"
+    shutil.copytree(runs, folder)
+    gone = dataclasses.replace(biped, source=str(tmp_path / "deleted.npz"))
+    said: list[str] = []
+    run_dir = pipeline.run(gone, "debug", folder, None, said.append)
+    assert said == [f"{run_dir} is finished; its source is no longer there to compare"]
+    with pytest.raises(FileNotFoundError, match=r"deleted\.npz"):
+        pipeline.run(
+            dataclasses.replace(gone, total_env_steps=96), "debug", folder, None, said.append
+        )
+
+
 def test_a_refused_run_leaves_its_name_free(biped: TrainConfig, runs: Path, tmp_path: Path) -> None:
     path = str(runs / "biped-twirl-debug-s0")
     wide = dataclasses.replace(biped.droq, num_critics=3)
@@ -258,8 +288,8 @@ def test_a_learned_source_is_noisy_only_while_its_data_are_collected(
 
 
 def test_the_replay_of_another_task_is_no_source_data(biped: TrainConfig, tmp_path: Path) -> None:
-    stand = SimpleNamespace(header=SimpleNamespace(task="stand"))
-    source = pipeline.Source(None, "a stand run", "digest", stand, tmp_path)  # type: ignore[arg-type]
+    rundir.open_run(tmp_path, make_config("stand", "debug"))
+    source = pipeline.Source(None, "a stand run", "digest", None, tmp_path)  # type: ignore[arg-type]
     config = dataclasses.replace(biped, shift="icy")
     with pytest.raises(ValueError, match="is a run of task stand: its replay is no experience"):
         pipeline.source_data(config, tmp_path, source, print)

@@ -66,3 +66,33 @@ def test_stand_has_no_source_of_its_own() -> None:
     config = dataclasses.replace(make_config("stand", "cpu"), variant="twirl")
     with pytest.raises(ValueError, match="no source policy of its own"):
         source_of(config, "cpu")
+
+
+@pytest.mark.parametrize(
+    ("task", "option", "value"),
+    [
+        ("stand", "height_of", "root"),
+        ("biped", "distance_weight", 4.0),
+        ("biped", "distance_reward", "speed"),
+        ("hurdles", "hurdle_bonus", "clean"),
+        ("imitate", "clip", "own.json"),
+    ],
+)
+def test_a_replay_of_other_rewards_does_not_fit(task: str, option: str, value: object) -> None:
+    config = make_config(task, "cpu")
+    options = dataclasses.replace(getattr(config, task), **{option: value})
+    other = dataclasses.replace(config, **{task: options})
+    with pytest.raises(ValueError, match=rf"a run with {task}\.{option} {value!r} \(here .*anew"):
+        source_rules.check_replay_fits(config, other, Path("runs/other"))
+
+
+def test_a_replay_of_another_course_fits() -> None:
+    config = make_config("hurdles", "cpu")
+    wide = dataclasses.replace(config, hurdles=dataclasses.replace(config.hurdles, max_gap=3.7))
+    source_rules.check_replay_fits(config, wide, Path("runs/wide"))
+
+
+def test_course_options_are_options() -> None:
+    config = make_config("biped", "cpu")
+    for task, names in source_rules.COURSE_OPTIONS.items():
+        assert set(names) <= set(dataclasses.asdict(getattr(config, task)))

@@ -7,8 +7,6 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
-
 from twirl_mjx.assets import asset_path
 from twirl_mjx.checks import check_range
 from twirl_mjx.commands.options import parse, say
@@ -55,6 +53,7 @@ def main(argv: list[str], set_up: Callable[[bool], None]) -> int:
 def _show(path: Path, options: DemoOptions) -> None:
     import jax
 
+    from twirl_mjx.evaluation.measures import episode_means
     from twirl_mjx.evaluation.rollout import make_evaluate
     from twirl_mjx.policies.resolve import resolve_policy
     from twirl_mjx.tasks.registry import make_env
@@ -68,7 +67,7 @@ def _show(path: Path, options: DemoOptions) -> None:
 
     env = make_env(config, num_envs=options.episodes)
     values = make_evaluate(env, policy.init, act)(None, jax.random.key(options.seed))
-    means = ", ".join(f"{name} {np.mean(value):.3g}" for name, value in values.items())
+    means = ", ".join(f"{name} {value:.3g}" for name, value in episode_means(values).items())
     say(f"{path.stem}: {means}")
     if options.film:
         wanted = RenderOptions(str(path), seed=options.seed, seconds=options.seconds)

@@ -179,6 +179,7 @@ def _evaluate_one(candidate: Candidate, options: EvaluateOptions) -> list[list[o
         for shift, measures in values.items()
         for measure, column in measures.items()
         for episode, value in enumerate(column)
+        if not np.isnan(value)
     ]
 
 
@@ -195,7 +196,7 @@ def _print_table(title: str, values: dict[str, dict[str, np.ndarray]]) -> None:
             shift,
             f"{found['return'].mean():.1f}",
             f"{iqm.estimate:.1f} [{iqm.low:.1f}, {iqm.high:.1f}]",
-            *(f"{(np.median if m in MEDIANS else np.mean)(found[m]):.3g}" for m in measures),
+            *(f"{(np.nanmedian if m in MEDIANS else np.nanmean)(found[m]):.3g}" for m in measures),
         )
     Console(width=None if sys.stdout.isatty() else 160).print(table)
 

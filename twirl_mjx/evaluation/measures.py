@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Literal, NamedTuple
 
 import flax.struct
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from twirl_mjx.sim.scene import CONTROL_DT
 from twirl_mjx.tasks.vector import EnvState
@@ -129,13 +131,25 @@ def tracker_step(task: str, tracker: Tracker, state: EnvState) -> Tracker:
 
 
 def tracker_read(task: str, tracker: Tracker) -> dict[str, jax.Array]:
-    """Return the measures so far, each [N], and ``success`` as 0 or 1."""
-    steps = jnp.maximum(tracker.steps, 1.0)
+    """Return the measures so far, each [N], and ``success`` as 0 or 1.
+
+    Sums of an episode without a step are 0; its means, minima and maxima are not defined (NaN).
+    """
     values = {}
     for name, m in MEASURES[task].items():
-        value = tracker.values[name] / steps if m.how == "mean" else tracker.values[name]
-        values[name] = value * m.scale
+        value = tracker.values[name] / tracker.steps if m.how == "mean" else tracker.values[name]
+        defined = (tracker.steps > 0.0) | (m.how == "sum")
+        values[name] = jnp.where(defined, value * m.scale, jnp.nan)
     return values | {"success": success(task, values).astype(jnp.float32)}
+
+
+def episode_means(values: Mapping[str, np.ndarray]) -> dict[str, float]:
+    """Return the mean of every measure over the episodes in which it is defined.
+
+    A measure that is defined in none is left out.
+    """
+    defined = {name: np.asarray(v)[~np.isnan(v)] for name, v in values.items()}
+    return {name: float(v.mean()) for name, v in defined.items() if v.size}
 
 
 def tracker_reset(task: str, tracker: Tracker, done: jax.Array) -> Tracker:

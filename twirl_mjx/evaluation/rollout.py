@@ -41,7 +41,7 @@ def first_episodes(
     Returns:
         Every measure of the task and ``success``, each [N]; steps after the first end of a world,
         and one with a non-finite state, do not count. ``invalid`` is 1 where the episode was cut
-        short by a non-finite state.
+        short by a non-finite state; measures are NaN where that was its first step.
     """
     task = env.task.name
     reset_key, act_key = jax.random.split(key)

@@ -136,7 +136,7 @@ def _info(metrics: dict[str, np.ndarray], *, invalid: bool) -> dict[str, Any]:
 
 def to_gymnasium(
     task: str,
-    shift: str = "none",
+    shift: str | None = None,
     *,
     render_mode: str | None = None,
     engine: str = "native",
@@ -158,7 +158,7 @@ def to_gymnasium(
 
 
 def to_brax(
-    task: str, shift: str = "none", *, num_envs: int | None = None, **options: Any
+    task: str, shift: str | None = None, *, num_envs: int | None = None, **options: Any
 ) -> BraxEnv:
     """Return the worlds of a task as a ``brax.envs.base.Env``.
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
+from typing import Any
 
 from twirl_mjx.checks import check_choice
 from twirl_mjx.config import TASKS as TASK_NAMES
@@ -77,11 +78,11 @@ def make_env(
 
 def make(
     task: str,
-    shift: str = "none",
-    num_envs: int = 256,
+    shift: str | None = None,
+    num_envs: int | None = None,
     *,
-    shift_strength: float = 1.0,
-    engine: str = "auto",
+    shift_strength: float | None = None,
+    engine: str | None = None,
     config: TrainConfig | None = None,
 ) -> VectorEnv:
     """Return vectorised worlds of a task.
@@ -92,18 +93,24 @@ def make(
         num_envs: Worlds stepped together.
         shift_strength: 0 is nominal, 1 the paper's value.
         engine: auto, mjx or native.
-        config: Further options; the paper's defaults when not given.
+        config: Everything that is not given here; without it the paper's defaults, no shift and
+            256 worlds.
 
     Raises:
         ValueError: An unknown name or a value out of range, with the nearest valid choice.
     """
     check_choice("task", task, TASK_NAMES)
-    base = config or TrainConfig(task=task)
-    env = dataclasses.replace(base.env, num_envs=num_envs, engine=engine)  # type: ignore[arg-type]
+    if num_envs is None:
+        num_envs = config.env.num_envs if config else 256
+    base = config or TrainConfig()
+    env = dataclasses.replace(base.env, num_envs=num_envs, **_given(engine=engine))
     droq = dataclasses.replace(base.droq, utd=base.droq.updates_per_block / num_envs)
+    conditions = _given(shift=shift, shift_strength=shift_strength)
     return make_env(
-        dataclasses.replace(
-            base, task=task, shift=shift, shift_strength=shift_strength, env=env, droq=droq
-        ),
-        training=True,
+        dataclasses.replace(base, task=task, env=env, droq=droq, **conditions), training=True
     )
+
+
+def _given(**options: Any) -> dict[str, Any]:
+    """Return the options that are not None."""
+    return {name: value for name, value in options.items() if value is not None}

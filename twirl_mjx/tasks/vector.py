@@ -32,7 +32,8 @@ class EnvState(flax.struct.PyTreeNode):
     """State of N worlds between two control steps; reset and step return identical shapes."""
 
     data: mjx.Data
-    """Simulation data of all worlds, after auto-reset; leaves [N, ...]."""
+    """Simulation data of all worlds, after auto-reset; leaves [N, ...]. Only ``PHYSICS_STATE`` is
+    of this instant; call ``mjx.forward`` for derived fields (``xpos``, ...)."""
     obs: jax.Array
     """[N, O] what the policy sees next, after auto-reset."""
     next_obs: jax.Array

@@ -9,6 +9,7 @@ dataset.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -149,23 +150,15 @@ class Checkpoints:
         """Release the manager."""
         self._manager.close()
 
-    def _segments(self) -> list[tuple[int, int, Path]]:
-        """Return (first, end, path) of the stored row ranges, in order."""
-        found = []
-        for path in self._replay.glob("rows_*.npy"):
-            first, end = map(int, path.stem.split("_")[1:])
-            found.append((first, end, path))
-        return sorted(found)
-
     def _append_rows(self, state: TrainState) -> None:
         """Write the online rows inserted since the last checkpoint."""
         total = int(state.inserted)
         capacity = state.replay.online.capacity
-        for first, _, path in self._segments():  # left by a run that died after writing them
+        for first, _, path in _segments(self._replay):  # left by a run that died after writing them
             latest = self.latest()
             if latest is None or first >= self._logged(latest):
                 path.unlink()
-        stored = max([end for _, end, _ in self._segments()], default=0)
+        stored = max([end for _, end, _ in _segments(self._replay)], default=0)
         first = max(stored, total - capacity)
         if first >= total:
             return
@@ -187,27 +180,49 @@ class Checkpoints:
         """Rebuild the online ring from the log."""
         online = template.replay.online
         total, capacity = int(state.inserted), online.capacity
-        first_needed = max(0, total - capacity)
         rows = np.zeros(online.rows.shape, np.float32)
-        have = first_needed
-        for first, end, path in self._segments():
-            if end <= have or first >= total:
-                continue
-            if first > have:
-                break
-            part = np.load(path)[have - first : total - first]
-            rows[np.arange(have, have + len(part)) % capacity] = part
-            have += len(part)
-        if have < total:
-            raise ValueError(f"replay log in {self._replay} ends at row {have}, need {total}")
+        begin = max(0, total - capacity)
+        for first, part in _stored_rows(self._replay, begin, total):
+            rows[np.arange(first, first + len(part)) % capacity] = part
         return state.replay.online.replace(rows=jnp.asarray(rows))
 
     def _prune(self, state: TrainState) -> None:
         """Delete rows that no kept checkpoint needs."""
         oldest = min(self._logged(step) for step in self._manager.all_steps())
-        for _, end, path in self._segments():
+        for _, end, path in _segments(self._replay):
             if end <= oldest - state.replay.online.capacity:
                 path.unlink()
+
+
+def _segments(folder: Path) -> list[tuple[int, int, Path]]:
+    """Return (first, end, path) of the row ranges in a replay log, in order."""
+    found = []
+    for path in folder.glob("rows_*.npy"):
+        first, end = map(int, path.stem.split("_")[1:])
+        found.append((first, end, path))
+    return sorted(found)
+
+
+def _stored_rows(folder: Path, begin: int, end: int) -> Iterator[tuple[int, np.ndarray]]:
+    """Yield the rows ``begin`` to ``end`` of a replay log piece by piece, each with its first row.
+
+    Between two checkpoints the ring may have gone round, so a log has gaps; none is in the range
+    that the ring of a checkpoint holds.
+
+    Raises:
+        ValueError: A row of the range is missing.
+    """
+    have = begin
+    for first, last, path in _segments(folder):
+        if last <= have or first >= end:
+            continue
+        if first > have:
+            break
+        part = np.load(path)[have - first : end - first]
+        yield have, part
+        have += len(part)
+    if have < end:
+        raise ValueError(f"the replay log in {folder} lacks row {have} of {begin} to {end - 1}")
 
 
 def _bare(state: TrainState) -> Any:
@@ -226,6 +241,16 @@ def _open(run_dir: Path) -> tuple[ocp.CheckpointManager, int]:
     if manager is None or step is None:
         raise FileNotFoundError(f"{run_dir} has no checkpoint: its train state is needed here")
     return manager, step
+
+
+def has_checkpoint(run_dir: Path) -> bool:
+    """Return whether a run can be resumed; nothing is created."""
+    try:
+        manager, _ = _open(run_dir)
+    except FileNotFoundError:
+        return False
+    manager.close()
+    return True
 
 
 def load_learner(run_dir: Path) -> dict[str, Any]:
@@ -258,15 +283,14 @@ def load_replay(run_dir: Path) -> np.ndarray:
 
     Raises:
         FileNotFoundError: The run has no checkpoint or no stored experience.
+        ValueError: Rows of the replay log are missing.
     """
     manager, step = _open(run_dir)
     found = manager.restore(step, args=ocp.args.Composite(progress=ocp.args.JsonRestore()))
     manager.close()
     total = int(found["progress"]["inserted"])
-    paths = sorted((run_dir / "checkpoints" / "replay").glob("rows_*.npy"))
-    if not paths:
+    folder = run_dir / "checkpoints" / "replay"
+    if not _segments(folder):
         raise FileNotFoundError(f"{run_dir} has no stored experience")
-    first = int(paths[0].stem.split("_")[1])
-    capacity = rundir.read_config(run_dir).replay.capacity
-    kept = slice(max(0, total - capacity - first), total - first)
-    return np.concatenate([np.load(path) for path in paths])[kept]
+    begin = max(0, total - rundir.read_config(run_dir).replay.capacity)
+    return np.concatenate([part for _, part in _stored_rows(folder, begin, total)])

@@ -18,6 +18,7 @@ import numpy as np
 from twirl_mjx.config import TrainConfig
 from twirl_mjx.droq import learner as droq
 from twirl_mjx.droq.state import DroqState
+from twirl_mjx.evaluation.measures import episode_means
 from twirl_mjx.evaluation.rollout import make_evaluate
 from twirl_mjx.policies.learned import NumpyPolicy, PolicyHeader, load_policy, save_policy
 from twirl_mjx.replay.ring import RingBuffer
@@ -25,7 +26,7 @@ from twirl_mjx.tasks.observations import layout_slices
 from twirl_mjx.tasks.registry import make_env
 from twirl_mjx.tasks.vector import VectorEnv
 from twirl_mjx.training import rundir, state
-from twirl_mjx.training.checkpoint import Checkpoints
+from twirl_mjx.training.checkpoint import Checkpoints, has_checkpoint
 from twirl_mjx.training.metrics import RunLogger
 from twirl_mjx.training.signals import stop_on_signal
 from twirl_mjx.training.state import TrainState
@@ -100,6 +101,19 @@ def check_finite(learner: DroqState) -> None:
             )
 
 
+def check_experience(train_state: TrainState) -> None:
+    """Check that the worlds give transitions to learn from.
+
+    Raises:
+        DivergedError: Every transition so far had a state that is not finite and was dropped.
+    """
+    if not int(train_state.inserted):
+        raise DivergedError(
+            f"none of {int(train_state.env_steps):,} transitions was finite: the worlds diverge"
+            " from the start; look at the task's options and at the dynamics"
+        )
+
+
 class Run:
     """One training run: owns the directory, the compiled functions and the loop's bookkeeping."""
 
@@ -119,6 +133,7 @@ class Run:
         self.stage = stage
         self.source = source
         self.source_rows = 0.0 if source is None else float(source.size)
+        self.resumed_at: int | None = None
         self.took_weights = False
         self.progress: dict[str, Any] = {"best": -math.inf, "wall_s": 0.0, "inserted": 0}
         env = make_env(config, num_envs=config.eval.episodes)
@@ -143,13 +158,14 @@ class Run:
                 self.took_weights = True
         else:
             made, progress = self.checkpoints.restore(jax.eval_shape(fresh, key))
+            self.resumed_at = int(made.env_steps)
             self.progress |= progress
         return made.replace(replay=made.replay.replace(source=self.source))
 
     def evaluate(self, train_state: TrainState) -> dict[str, float]:
         """Evaluate the deterministic policy on the evaluation seed; keep the best policy."""
         values = self._evaluate(train_state.learner.actor, jax.random.key(self.config.eval.seed))
-        means = {name: float(np.mean(v)) for name, v in values.items()}
+        means = episode_means(values)
         self.save_policy("policy_last.npz", train_state, means)
         if means["return"] > self.progress["best"]:
             self.progress["best"] = means["return"]
@@ -202,6 +218,7 @@ class Run:
             values = {name: float(value) for name, value in metrics.items()}
             values |= {"replay_ratio": config.droq.replay_ratio, "source_rows": self.source_rows}
             check_finite(train_state.learner)
+            check_experience(train_state)
             self.progress["wall_s"] = before + time.monotonic() - began
             now = int(train_state.env_steps)
             if now // config.eval.every > steps // config.eval.every or (
@@ -235,7 +252,7 @@ def train(
         stage: Name shown with the progress.
 
     Raises:
-        RunMismatchError: The directory holds another run.
+        RunMismatchError: The directory holds another run, or a finished one that cannot go on.
         DivergedError: The learner is no longer finite.
         ValueError: Source data are needed and missing.
     """
@@ -244,14 +261,19 @@ def train(
     rundir.check_run(run_dir, config)
     if (done := finished(run_dir, config.total_env_steps)) is not None:
         return done
+    check_resumable(run_dir)
     run = Run(config, run_dir, source, stage)
     try:
         train_state = run.start(initial)
-        steps = int(train_state.env_steps)
+        steps = run.resumed_at or 0
         with (
             stop_on_signal() as stop,
             RunLogger(
-                run_dir, rundir.identity(run_dir, config), config.total_env_steps, stage, steps
+                run_dir,
+                rundir.identity(run_dir, config),
+                config.total_env_steps,
+                stage,
+                run.resumed_at,
             ) as logger,
         ):
             if steps:
@@ -282,7 +304,22 @@ def final_evaluation(config: TrainConfig, run_dir: Path, env_steps: int) -> dict
     evaluate = make_evaluate(env, no_memory, act_mean)
     values = evaluate(actor, jax.random.key(config.eval.seed + 1))
     write_episodes(run_dir / EVAL_CSV, rundir.identity(run_dir, config), env_steps, values)
-    return {name: float(np.mean(v)) for name, v in values.items()}
+    return episode_means(values)
+
+
+def check_resumable(run_dir: Path) -> None:
+    """Refuse a run that was finished and cannot go on: starting anew would replace its policy.
+
+    Raises:
+        RunMismatchError: It has an ``eval.csv`` but no checkpoint.
+    """
+    done = finished(run_dir, 0)
+    if done is not None and not has_checkpoint(run_dir):
+        raise rundir.RunMismatchError(
+            f"{run_dir} was finished at {done.env_steps:,} transitions and its checkpoints are"
+            " gone, so it cannot go on; nothing was touched. Give another --name; its policy can"
+            f" start that run: --variant weights --source {run_dir}/policy.npz"
+        )
 
 
 def finished(run_dir: Path, total_env_steps: int) -> Outcome | None:
@@ -298,20 +335,19 @@ def finished(run_dir: Path, total_env_steps: int) -> Outcome | None:
             values.setdefault(row["metric"], []).append(float(row["value"]))
     if env_steps < total_env_steps:
         return None
-    return Outcome(True, env_steps, {name: float(np.mean(v)) for name, v in values.items()})
+    return Outcome(True, env_steps, episode_means({k: np.array(v) for k, v in values.items()}))
 
 
 def write_episodes(
     path: Path, identity: dict[str, str], env_steps: int, values: dict[str, np.ndarray]
 ) -> None:
-    """Write episode measures [E] as a tidy table, whole or not at all."""
+    """Write episode measures [E] as a tidy table, whole or not at all; NaN has no row."""
     partial = path.with_name(path.name + ".partial")
     with partial.open("w", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(EVAL_COLUMNS)
         for name, column in values.items():
-            for episode, value in enumerate(column):
-                writer.writerow(
-                    [*identity.values(), env_steps, episode, name, f"{float(value):.9g}"]
-                )
+            for episode in np.flatnonzero(~np.isnan(column)):
+                row = [env_steps, episode, name, f"{float(column[episode]):.9g}"]
+                writer.writerow([*identity.values(), *row])
     partial.replace(path)

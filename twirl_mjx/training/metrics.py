@@ -174,7 +174,7 @@ class RunLogger:
         identity: Mapping[str, Any],
         total_env_steps: int,
         stage: str,
-        resume_env_steps: int = 0,
+        resume_env_steps: int | None = None,
         *,
         console: Console | None = None,
         tensorboard: bool = True,
@@ -187,7 +187,7 @@ class RunLogger:
             total_env_steps: transitions at which the stage is finished.
             stage: what the run is doing, for the display (``source``, ``collect``, ``train``).
             resume_env_steps: transitions of the checkpoint this run resumes from; rows after it
-                are dropped, 0 starts the files anew.
+                are dropped; None starts the files anew.
             console: where progress goes; standard output by default.
             tensorboard: also write TensorBoard events.
 
@@ -200,19 +200,20 @@ class RunLogger:
         run_dir = Path(run_dir)
         run_dir.mkdir(parents=True, exist_ok=True)
         path = run_dir / CSV_NAME
-        resumes = resume_env_steps > 0 and path.exists()
-        earlier = truncate_csv(path, resume_env_steps) if resumes else 0.0
+        begin = resume_env_steps or 0
+        resumes = resume_env_steps is not None and path.exists()
+        earlier = truncate_csv(path, begin) if resumes else 0.0
         self._file = path.open("a" if resumes else "w", newline="")
         self._csv = csv.writer(self._file, lineterminator="\n")
         if not resumes:
             self._csv.writerow(COLUMNS)
             self._sync()
-        self._board = _open_board(run_dir, resume_env_steps) if tensorboard else None
+        self._board = _open_board(run_dir, begin) if tensorboard else None
         self._start = time.monotonic() - earlier
         self._compile_s = self._aside_s = 0.0
-        self._last = (resume_env_steps, 0, time.monotonic()) if not resume_env_steps else None
+        self._last = (0, 0, time.monotonic()) if not begin else None
         self._view = ProgressView(console or Console(), stage, self._identity[0], total_env_steps)
-        self._view.start(resume_env_steps)
+        self._view.start(begin)
 
     def __enter__(self) -> RunLogger:
         return self

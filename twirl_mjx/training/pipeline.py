@@ -16,7 +16,6 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from twirl_mjx import config_json, exits
 from twirl_mjx.config import TrainConfig
@@ -27,7 +26,7 @@ from twirl_mjx.replay import dataset, ring
 from twirl_mjx.tasks.imitate import load_clip
 from twirl_mjx.tasks.registry import make_env
 from twirl_mjx.training import loop, rundir, source_rules
-from twirl_mjx.training.checkpoint import load_replay
+from twirl_mjx.training.checkpoint import has_checkpoint, load_replay
 from twirl_mjx.training.source import Source, collect
 from twirl_mjx.training.weights import check_weights_fit, source_weights
 
@@ -65,8 +64,13 @@ def run(config: TrainConfig, preset: str, runs_dir: Path, name: str | None, say:
                 return run_dir
             return _train(config, run_dir, None, None)
     check_weights_fit(config, preset)
+    refuse_early(config, run_dir)
+    if _outlived_its_source(config, preset, runs_dir, run_dir):
+        say(f"{run_dir} is finished; its source is no longer there to compare")
+        return run_dir
     source = find_source(config, preset, runs_dir, say)
-    initial = source_weights(config, source, say) if config.uses_source_weights else None
+    fresh_weights = config.uses_source_weights and not has_checkpoint(run_dir)
+    initial = source_weights(config, source, say) if fresh_weights else None
     with rundir.exclusive(run_dir):
         if is_finished(config, run_dir, source, say):
             return run_dir
@@ -75,6 +79,35 @@ def run(config: TrainConfig, preset: str, runs_dir: Path, name: str | None, say:
             return zero_shot(config, run_dir, source, say)
         data = source_data(config, run_dir, source, say) if config.uses_source_data else None
         return _train(config, run_dir, data, initial)
+
+
+def refuse_early(config: TrainConfig, run_dir: Path) -> None:
+    """Refuse what needs no source to be refused: finding one may mean to train it for an hour.
+
+    Raises:
+        RunMismatchError: Another run lives there, or a finished one that cannot go on.
+        RunBusyError: Another process works there.
+    """
+    rundir.check_run(run_dir, config)
+    if rundir.owner(run_dir):
+        raise rundir.busy(run_dir)
+    if config.variant != "zero-shot" and not loop.finished(run_dir, config.total_env_steps):
+        loop.check_resumable(run_dir)
+
+
+def _outlived_its_source(config: TrainConfig, preset: str, runs_dir: Path, run_dir: Path) -> bool:
+    """Return whether a run is finished and what it started from has been deleted."""
+    if config.variant == "zero-shot" or not loop.finished(run_dir, config.total_env_steps):
+        return False
+    match source_rules.source_of(config, preset):
+        case source_rules.Scripted():
+            return False
+        case source_rules.AtPath(path):
+            return not path.exists()
+        case source_rules.RunOf(first):
+            return not (runs_dir / rundir.default_name(first, preset)).exists()
+        case source_rules.NominalRun():
+            return not _nominal_dir(config, preset, runs_dir).exists()
 
 
 def is_finished(config: TrainConfig, run_dir: Path, source: Source | None, say: Say) -> bool:
@@ -137,9 +170,7 @@ def scripted_digest(config: TrainConfig) -> str:
 
 def _nominal_run(config: TrainConfig, preset: str, runs_dir: Path) -> Source:
     """Return the finished run of the same task and preset without a shift."""
-    variant = make_config(config.task, preset).variant
-    nominal = dataclasses.replace(config, shift="none", variant=variant)
-    run_dir = runs_dir / rundir.default_name(nominal, preset)
+    run_dir = _nominal_dir(config, preset, runs_dir)
     if (run_dir / loop.EVAL_CSV).is_file():
         return _from_path(config, run_dir)
     others = sorted(path.parent.name for path in runs_dir.glob(f"{config.task}-*/{loop.EVAL_CSV}"))
@@ -148,6 +179,12 @@ def _nominal_run(config: TrainConfig, preset: str, runs_dir: Path) -> Source:
         f" no {run_dir}. Run `make train TASK={config.task}` first, or name a run or policy with"
         f" --source (finished in {runs_dir}: {', '.join(others) or 'none'})"
     )
+
+
+def _nominal_dir(config: TrainConfig, preset: str, runs_dir: Path) -> Path:
+    variant = make_config(config.task, preset).variant
+    nominal = dataclasses.replace(config, shift="none", variant=variant)
+    return runs_dir / rundir.default_name(nominal, preset)
 
 
 def _from_path(config: TrainConfig, path: Path) -> Source:
@@ -168,13 +205,7 @@ def source_data(config: TrainConfig, run_dir: Path, source: Source, say: Say) ->
     """
     env = make_env(config)
     if config.shift != "none" and source.run_dir is not None:
-        task = source.numpy_policy.header.task
-        if task != config.task:
-            raise ValueError(
-                f"{source.run_dir} is a run of task {task}: its replay is no experience of"
-                f" {config.task} (nearest: a run of {config.task}, or its policy file"
-                f" {source.run_dir / 'policy.npz'}, which is rolled out anew)"
-            )
+        source_rules.check_replay_fits(config, rundir.read_config(source.run_dir), source.run_dir)
         rows = load_replay(source.run_dir)
         data = ring.from_rows(jnp.asarray(rows), env.observation_size, env.action_size)
         say(f"source data: the replay of {source.run_dir}, {len(rows):,} transitions")
@@ -244,6 +275,7 @@ def describe(means: dict[str, float]) -> str:
 
 def zero_shot(config: TrainConfig, run_dir: Path, source: Source, say: Say) -> Path:
     """Evaluate the source policy in the target task without training it."""
+    from twirl_mjx.evaluation.measures import episode_means
     from twirl_mjx.evaluation.rollout import make_evaluate
 
     env = make_env(config, num_envs=config.eval.final_episodes)
@@ -254,5 +286,5 @@ def zero_shot(config: TrainConfig, run_dir: Path, source: Source, say: Say) -> P
     evaluate = make_evaluate(env, source.policy.init, act)
     values = evaluate(None, jax.random.key(config.eval.seed + 1))
     loop.write_episodes(run_dir / loop.EVAL_CSV, rundir.identity(run_dir, config), 0, values)
-    say(f"zero-shot: {describe({k: float(np.mean(v)) for k, v in values.items()})}")
+    say(f"zero-shot: {describe(episode_means(values))}")
     return run_dir

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import fcntl
+import functools
 import hashlib
 import importlib.metadata
 import json
@@ -56,15 +57,20 @@ def exclusive(run_dir: Path, wait_s: float = 1.0) -> Iterator[None]:
         deadline = time.monotonic() + wait_s
         while not _try_lock(file.fileno(), fcntl.LOCK_EX):
             if time.monotonic() > deadline:
-                raise RunBusyError(
-                    f"{run_dir} is in use by {owner(run_dir) or 'another process'}: wait for it,"
-                    " stop it, or give another --name"
-                )
+                raise busy(run_dir)
             time.sleep(0.1)
         file.truncate(0)
         file.write(f"process {os.getpid()} on {platform.node()}")
         file.flush()
         yield
+
+
+def busy(run_dir: Path) -> RunBusyError:
+    """Return the refusal to work in a directory that another process holds."""
+    return RunBusyError(
+        f"{run_dir} is in use by {owner(run_dir) or 'another process'}: wait for it,"
+        " stop it, or give another --name"
+    )
 
 
 def owner(run_dir: Path) -> str | None:
@@ -168,8 +174,12 @@ def read_config(run_dir: Path) -> TrainConfig:
     return config_json.from_json(path.read_text())
 
 
+@functools.cache
 def versions() -> dict[str, str]:
-    """Return the versions of packages, interpreter, machine and source code."""
+    """Return the versions of packages, interpreter, machine and source code.
+
+    Looked up once: a commit made while a process runs is not the code it runs.
+    """
     found = {}
     for package in PACKAGES:
         try:

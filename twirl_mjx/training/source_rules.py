@@ -41,6 +41,42 @@ class RunOf:
     config: TrainConfig
 
 
+COURSE_OPTIONS = {
+    "biped": ("goal_mean_radius", "goal_min_radius", "goal_max_radius", "fixed_goal"),
+    "hurdles": ("min_gap", "max_gap", "fixed_gap"),
+    "stand": ("risen_fraction",),
+    "imitate": ("standing_fraction",),
+}
+"""Options that only place robot, goals or hurdles; all others decide rewards or endings."""
+
+
+def check_replay_fits(config: TrainConfig, nominal: TrainConfig, run_dir: Path) -> None:
+    """Check that the replay of a nominal run is experience of the task of ``config``.
+
+    Its transitions keep the rewards they were paid (paper Alg. 1: those of the target task).
+
+    Args:
+        config: The run that adapts.
+        nominal: Config of the run it adapts from.
+        run_dir: Directory of that run.
+
+    Raises:
+        ValueError: Another task, or options by which other rewards are paid.
+    """
+    task = config.task
+    what = f" of task {nominal.task}" if nominal.task != task else ""
+    if not what:
+        ours, theirs = (dataclasses.asdict(getattr(c, task)) for c in (config, nominal))
+        different = [k for k in ours if ours[k] != theirs[k] and k not in COURSE_OPTIONS[task]]
+        what = ", ".join(f" with {task}.{k} {theirs[k]!r} (here {ours[k]!r})" for k in different)
+    if what:
+        raise ValueError(
+            f"{run_dir} is a run{what}: its replay is no experience of this {task} (nearest: a run"
+            f" of the same task, or the policy file {run_dir / 'policy.npz'}, which is rolled out"
+            " anew)"
+        )
+
+
 def source_of(config: TrainConfig, preset: str) -> NominalRun | Scripted | AtPath | RunOf:
     """Return the source of a run that has one.
 
