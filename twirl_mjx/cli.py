@@ -81,6 +81,10 @@ def _import_quietly(module: str) -> Any:
         return importlib.import_module(module)
 
 
+UNUSABLE_PATHS = (FileNotFoundError, IsADirectoryError, NotADirectoryError, PermissionError)
+"""What paths given by a person may lead to."""
+
+
 def main(argv: list[str] | None = None) -> int:
     """Run one command.
 
@@ -103,7 +107,7 @@ def main(argv: list[str] | None = None) -> int:
             return _import_command(name).main(rest, set_up)
         os.environ.setdefault("MUJOCO_GL", "disable")
         return _import_command(name).main(rest)
-    except (ValueError, FileNotFoundError) as error:
+    except (ValueError, *UNUSABLE_PATHS) as error:
         print(f"twirl {name}: {error}", file=sys.stderr)
         return exits.UNUSABLE
     except RuntimeError as error:

@@ -72,7 +72,10 @@ class DroqConfig:
             check_range("droq.target_entropy", self.target_entropy, -1e4, 1e4)
         check_choice("droq.matmul_dtype", self.matmul_dtype, ("float32", "bfloat16"))
         if not self.hidden_sizes or min(self.hidden_sizes) < 1:
-            raise ValueError(f"droq.hidden_sizes = {self.hidden_sizes} needs sizes >= 1")
+            nearest = tuple(max(1, size) for size in self.hidden_sizes or (128, 128))
+            raise ValueError(
+                f"droq.hidden_sizes = {self.hidden_sizes} needs sizes >= 1 (nearest: {nearest})"
+            )
 
     @property
     def replay_ratio(self) -> float:

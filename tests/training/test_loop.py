@@ -19,7 +19,7 @@ from twirl_mjx.config import TrainConfig
 from twirl_mjx.droq import learner as droq
 from twirl_mjx.policies.learned import load_policy
 from twirl_mjx.replay import ring
-from twirl_mjx.training import loop, rundir, state
+from twirl_mjx.training import guards, loop, rundir, state
 from twirl_mjx.training.checkpoint import Checkpoints, load_learner, load_replay
 from twirl_mjx.training.state import TrainState
 
@@ -144,8 +144,8 @@ def test_a_finished_run_without_checkpoints_is_not_trained_anew(
 
 def test_worlds_that_only_diverge_stop_the_run() -> None:
     counts = SimpleNamespace(inserted=jnp.int32(0), env_steps=jnp.int32(64))
-    with pytest.raises(loop.DivergedError, match="none of 64 transitions was finite"):
-        loop.check_experience(counts)  # type: ignore[arg-type]
+    with pytest.raises(guards.DivergedError, match="none of 64 transitions was finite"):
+        guards.check_experience(counts)  # type: ignore[arg-type]
 
 
 def test_finished_run_is_left_alone(stand_config: TrainConfig, whole_run: Path) -> None:
@@ -231,9 +231,9 @@ def test_diverged_learner_names_the_tensor(stand_config: TrainConfig, whole_run:
     broken = learner.replace(
         actor=learner.actor | {"mean": learner.actor["mean"] | {"kernel": kernel}}
     )
-    loop.check_finite(learner)
-    with pytest.raises(loop.DivergedError, match=r"actor\.mean\.kernel"):
-        loop.check_finite(broken)
+    guards.check_finite(learner)
+    with pytest.raises(guards.DivergedError, match=r"actor\.mean\.kernel"):
+        guards.check_finite(broken)
 
 
 def test_source_data_are_required(stand_config: TrainConfig, tmp_path: Path) -> None:

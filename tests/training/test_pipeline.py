@@ -202,6 +202,30 @@ def test_what_needs_no_source_is_refused_before_one_is_sought(
         pipeline.run(trot, "debug", runs, None, print)
 
 
+@pytest.mark.parametrize(
+    ("name", "nearest"), [("../../evil", "evil"), ("a/b", "b"), ("..", "run"), ("/tmp/x", "x")]
+)
+def test_a_name_leads_nowhere_else(
+    name: str, nearest: str, biped: TrainConfig, tmp_path: Path
+) -> None:
+    with pytest.raises(ValueError, match=rf"plain folder name \(nearest: '{nearest}'"):
+        pipeline.run(biped, "debug", tmp_path / "runs", name, print)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_gaps_are_checked_before_a_source_is_trained(tmp_path: Path) -> None:
+    config = make_config("hurdles", "debug")
+    narrow = dataclasses.replace(config, hurdles=dataclasses.replace(config.hurdles, min_gap=0.5))
+    with pytest.raises(ValueError, match=r"gaps from 0.5 to 2.6 m: .*nearest"):
+        pipeline.run(narrow, "debug", tmp_path, None, print)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_misspelt_source_is_told_the_nearest(biped: TrainConfig, runs: Path) -> None:
+    with pytest.raises(FileNotFoundError, match=r"no source trott: .*biped-twirl.*nearest: trot\)"):
+        pipeline.find_source(dataclasses.replace(biped, source="trott"), "debug", runs, print)
+
+
 def test_a_finished_run_outlives_its_source(biped: TrainConfig, runs: Path, tmp_path: Path) -> None:
     folder = tmp_path / "runs"
     shutil.copytree(runs, folder)

@@ -96,3 +96,14 @@ def test_course_options_are_options() -> None:
     config = make_config("biped", "cpu")
     for task, names in source_rules.COURSE_OPTIONS.items():
         assert set(names) <= set(dataclasses.asdict(getattr(config, task)))
+
+
+def test_a_source_without_effect_is_refused() -> None:
+    scratch = dataclasses.replace(make_config("biped", "cpu"), variant="scratch")
+    source_rules.check_source_is_used(scratch, "cpu")
+    imitate = dataclasses.replace(make_config("imitate", "cpu"), variant="scratch")
+    source_rules.check_source_is_used(imitate, "cpu")  # the preset's own: `clip`
+    with pytest.raises(
+        ValueError, match=r"source trot would do nothing .*nearest: --variant twirl"
+    ):
+        source_rules.check_source_is_used(dataclasses.replace(scratch, source="trot"), "cpu")

@@ -16,7 +16,8 @@ def main(argv: list[str]) -> int:
     config = options.config
     check_source(config, options.preset)
     source = pipeline.find_source(config, options.preset, options.runs, say)
-    run_dir = options.runs / (options.name or rundir.default_name(config, options.preset))
+    name = options.name or rundir.default_name(config, options.preset)
+    run_dir = options.runs / rundir.check_name(name)
     with rundir.exclusive(run_dir):
         rundir.open_run(run_dir, config, source.identity)
         path = run_dir / "source.npz"

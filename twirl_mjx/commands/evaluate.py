@@ -56,8 +56,9 @@ class EvaluateOptions:
     """Episodes per condition and policy."""
     seed: int = 2_000_003
     """Seed of the episodes; training never uses it."""
-    out: Path = Path("runs/evaluation.csv")
-    """Tidy table of every episode, replaced after every policy."""
+    out: Path | None = None
+    """Tidy table of every episode, replaced after every policy; by default
+    runs/evaluation-DATE-TIME.csv."""
     figure: Path | None = None
     """Also draw the returns as bars into this PNG file."""
 
@@ -84,15 +85,31 @@ def main(argv: list[str]) -> int:
     check_range("episodes", options.episodes, 1, 1_000_000)
     for shift in options.shifts:
         check_choice("shift", shift, SHIFTS)
+    out = options.out or Path("runs", f"evaluation-{time.strftime('%Y%m%d-%H%M%S')}.csv")
+    check_outputs(out, options.figure)
     candidates = resolve_all(options)
     rows: list[list[object]] = []
     for candidate in candidates:
         rows += _evaluate_one(candidate, options)
-        write_rows(options.out, rows)
-        say(f"wrote {options.out}: {len(rows):,} rows")
+        write_rows(out, rows)
+        say(f"wrote {out}: {len(rows):,} rows")
     if options.figure is not None:
-        _draw(options.out, options.figure)
+        _draw(out, options.figure)
     return 0
+
+
+def check_outputs(out: Path, figure: Path | None) -> None:
+    """Check where results go before anything is evaluated.
+
+    Raises:
+        ValueError: A folder where a file is meant, or a figure that is no PNG.
+    """
+    if out.is_dir():
+        raise ValueError(f"--out {out} is a folder (nearest: {out / 'evaluation.csv'})")
+    if figure is not None and (figure.is_dir() or figure.suffix != ".png"):
+        raise ValueError(
+            f"--figure {figure} is no PNG file (nearest: {figure.with_suffix('.png')})"
+        )
 
 
 def resolve_all(options: EvaluateOptions) -> list[Candidate]:
@@ -108,7 +125,7 @@ def resolve_all(options: EvaluateOptions) -> list[Candidate]:
         run = name_of(given)
         if run in candidates:
             raise ValueError(
-                f"{candidates[run].given} and {given} would both be {run!r} in {options.out}:"
+                f"{candidates[run].given} and {given} would both be {run!r} in the table:"
                 " evaluate them one by one with --out, or copy one to another name"
             )
         config = on_course(config_of(given, options.task), options)

@@ -67,7 +67,11 @@ class RehearsalConfig:
         """Check the steps and ranges."""
         steps = 1.0 / (CONTROL_HZ * self.sim_dt) if self.sim_dt > 0.0 else 0.0
         if steps < 1.0 or abs(steps - round(steps)) > 1e-6:
-            raise ValueError(f"sim_dt {self.sim_dt} s does not divide the control step of 0.05 s")
+            nearest = 1.0 / (CONTROL_HZ * max(1, round(steps or 50.0)))
+            raise ValueError(
+                f"sim_dt {self.sim_dt} s does not divide the control step of 0.05 s (nearest:"
+                f" {nearest:.6g})"
+            )
         if not 0.0 <= self.latency_ms <= 200.0:
             raise ValueError(f"latency_ms must be in [0, 200], got {self.latency_ms}")
         if not 0.0 <= self.full_torque_speed < self.no_load_speed:

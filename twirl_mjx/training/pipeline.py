@@ -8,6 +8,7 @@ shift the source is a finished nominal run of the same task, and its replay is t
 from __future__ import annotations
 
 import dataclasses
+import difflib
 import hashlib
 import json
 from collections.abc import Callable
@@ -18,13 +19,13 @@ import jax
 import jax.numpy as jnp
 
 from twirl_mjx import config_json, exits
-from twirl_mjx.config import TrainConfig
+from twirl_mjx.config import SCRIPTED_SOURCES, TrainConfig
 from twirl_mjx.droq.state import DroqState
 from twirl_mjx.policies.resolve import resolve_policy
 from twirl_mjx.presets import make_config
 from twirl_mjx.replay import dataset, ring
 from twirl_mjx.tasks.imitate import load_clip
-from twirl_mjx.tasks.registry import make_env
+from twirl_mjx.tasks.registry import make_env, make_task
 from twirl_mjx.training import loop, rundir, source_rules
 from twirl_mjx.training.checkpoint import has_checkpoint, load_replay
 from twirl_mjx.training.source import Source, collect
@@ -57,7 +58,9 @@ def run(config: TrainConfig, preset: str, runs_dir: Path, name: str | None, say:
         ValueError: The variant does not fit the task, or the source does not fit the variant.
         RunBusyError: Another process works in the run directory.
     """
-    run_dir = runs_dir / (name or rundir.default_name(config, preset))
+    run_dir = runs_dir / rundir.check_name(name or rundir.default_name(config, preset))
+    source_rules.check_source_is_used(config, preset)
+    make_task(config)  # refuses options that only the task can judge
     if config.variant == "scratch":
         with rundir.exclusive(run_dir):
             if is_finished(config, run_dir, None, say):
@@ -153,11 +156,24 @@ def find_source(config: TrainConfig, preset: str, runs_dir: Path, say: Say) -> S
             if is_shipped:
                 shown = f"assets/policies/{path.name}"
                 say(f"source: the shipped policy {shown} (--source train trains your own)")
+            if not path.exists():
+                raise FileNotFoundError(no_such_source(path, runs_dir))
             return _from_path(config, path)
         case source_rules.RunOf(first):
             run_dir = runs_dir / rundir.default_name(first, preset)
             say(f"stage 1 of 3: source policy, task {first.task}, in {run_dir}")
             return _from_path(config, run(first, preset, runs_dir, None, say))
+
+
+def no_such_source(path: Path, runs_dir: Path) -> str:
+    """Return what can be given instead of a source that does not exist."""
+    runs = sorted(str(found.parent) for found in runs_dir.glob("*/policy.npz"))
+    choices = [*SCRIPTED_SOURCES, *runs]
+    nearest = difflib.get_close_matches(str(path), choices, n=1, cutoff=0.0)[0]
+    return (
+        f"there is no source {path}: give a policy file, or one of {', '.join(choices)}"
+        f" (nearest: {nearest})"
+    )
 
 
 def scripted_digest(config: TrainConfig) -> str:
@@ -176,7 +192,8 @@ def _nominal_run(config: TrainConfig, preset: str, runs_dir: Path) -> Source:
     others = sorted(path.parent.name for path in runs_dir.glob(f"{config.task}-*/{loop.EVAL_CSV}"))
     raise FileNotFoundError(
         f"adapting {config.task} to {config.shift} starts from a finished nominal run; there is"
-        f" no {run_dir}. Run `make train TASK={config.task}` first, or name a run or policy with"
+        f" no {run_dir}. Run `make train TASK={config.task} SEED={config.seed}"
+        f' ARGS="--preset {preset}"` first, or name a run or policy with'
         f" --source (finished in {runs_dir}: {', '.join(others) or 'none'})"
     )
 

@@ -91,6 +91,21 @@ def _try_lock(descriptor: int, kind: int) -> bool:
     return True
 
 
+def check_name(name: str) -> str:
+    """Return the name of a run, which is that of a folder in the folder of all runs.
+
+    Raises:
+        ValueError: It leads elsewhere.
+    """
+    if name == ".." or name != Path(name).name:
+        nearest = Path(name).name.strip(".") or "run"
+        raise ValueError(
+            f"name {name!r} is no plain folder name (nearest: {nearest!r}; --runs says where runs"
+            " are kept)"
+        )
+    return name
+
+
 def default_name(config: TrainConfig, preset: str) -> str:
     """Return the name of a run when none is given."""
     shift = "" if config.shift == "none" else f"-{config.shift}"

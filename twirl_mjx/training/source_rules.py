@@ -77,6 +77,22 @@ def check_replay_fits(config: TrainConfig, nominal: TrainConfig, run_dir: Path) 
         )
 
 
+def check_source_is_used(config: TrainConfig, preset: str) -> None:
+    """Refuse a source that would have no effect.
+
+    Raises:
+        ValueError: The variant is ``scratch`` and a source is named that the preset does not name.
+    """
+    if config.variant == "scratch" and config.source not in (
+        "auto",
+        make_config(config.task, preset).source,
+    ):
+        raise ValueError(
+            f"variant scratch uses no source: --source {config.source} would do nothing"
+            " (nearest: --variant twirl)"
+        )
+
+
 def source_of(config: TrainConfig, preset: str) -> NominalRun | Scripted | AtPath | RunOf:
     """Return the source of a run that has one.
 

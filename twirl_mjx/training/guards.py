@@ -1,0 +1,49 @@
+"""What stops a training run: numbers that are no longer finite."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from twirl_mjx.droq.state import DroqState
+from twirl_mjx.training.state import TrainState
+
+
+class DivergedError(RuntimeError):
+    """The learner produced a number that is not finite; the last good checkpoint is kept."""
+
+
+@jax.jit
+def _finite(tree: Any) -> Any:
+    return jax.tree.map(lambda x: jnp.all(jnp.isfinite(x)), tree)
+
+
+def check_finite(learner: DroqState) -> None:
+    """Check that every number of the learner is finite.
+
+    Raises:
+        DivergedError: Naming the first tensor that is not.
+    """
+    for path, good in jax.tree_util.tree_flatten_with_path(_finite(learner))[0]:
+        if not bool(good):
+            name = jax.tree_util.keystr(path, simple=True, separator=".")
+            raise DivergedError(
+                f"the learner diverged: {name} is not finite. The last good checkpoint is kept;"
+                " start from its policy with a smaller droq.learning_rate: another --name,"
+                " --variant weights and --source this run"
+            )
+
+
+def check_experience(train_state: TrainState) -> None:
+    """Check that the worlds give transitions to learn from.
+
+    Raises:
+        DivergedError: Every transition so far had a state that is not finite and was dropped.
+    """
+    if not int(train_state.inserted):
+        raise DivergedError(
+            f"none of {int(train_state.env_steps):,} transitions was finite: the worlds diverge"
+            " from the start; look at the task's options and at the dynamics"
+        )
