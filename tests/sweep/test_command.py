@@ -5,8 +5,12 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import io
+import os
+import signal
+import threading
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -244,3 +248,23 @@ def test_a_job_is_the_command_a_user_could_type(grid_file: Path, tmp_path: Path)
     assert job.argv[:5] == ("-m", "twirl_mjx", "train", "--preset", "debug")
     assert job.log == str(tmp_path / cell.name / "sweep.log")
     assert job.needs == cell.needs != ()
+
+
+def test_a_signal_reaches_the_sweep_although_ray_takes_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Taking(contextlib.nullcontext):  # as Ray does when it starts
+        def __init__(self, **_: object) -> None:
+            super().__init__()
+            signal.signal(signal.SIGTERM, lambda *_: pytest.fail("Ray ends the sweep"))
+
+    def run_all(*_: object, stop: threading.Event, **__: object) -> bool:
+        os.kill(os.getpid(), signal.SIGTERM)
+        return stop.wait(10.0)
+
+    old = signal.getsignal(signal.SIGTERM)
+    monkeypatch.setattr(sweep, "RayExecutor", Taking)
+    monkeypatch.setattr(sweep, "run_all", run_all)
+    try:
+        view: Any = SimpleNamespace(update=None, say=None)
+        assert sweep._run([], Path("runs"), sweep.SweepOptions("utd"), view)
+    finally:
+        signal.signal(signal.SIGTERM, old)

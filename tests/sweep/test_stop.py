@@ -5,6 +5,7 @@ from __future__ import annotations
 import _thread
 import itertools
 import os
+import signal
 import threading
 import time
 from pathlib import Path
@@ -113,6 +114,18 @@ def test_an_interrupted_worker_lets_its_child_save(tmp_path: Path) -> None:
     watcher.join()
     assert ending.code == 130
     assert (tmp_path / "a.out").read_text() == "saved"
+
+
+def test_a_worker_of_a_background_sweep_can_be_interrupted(tmp_path: Path) -> None:
+    old = signal.signal(signal.SIGINT, signal.SIG_IGN)  # as after `nohup make sweep &`
+    try:
+        watcher = interrupt_when(tmp_path / "a.out", "up", 1)
+        ending = run_job(make(tmp_path, "a", SAVE.format(slow=False)), pin=False)
+        watcher.join()
+        assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGINT, old)
+    assert ending.code == 130
 
 
 def test_a_second_interrupt_kills_the_child(tmp_path: Path) -> None:

@@ -170,10 +170,10 @@ def _run(
 ) -> dict[str, Progress]:
     jobs = [job_of(cell, runs) for cell in todo]
     with (
-        stop_on_signal() as stop,
         RayExecutor(
             address=options.address, workers=options.workers, gpus=options.gpus
         ) as executor,
+        stop_on_signal() as stop,  # after Ray, which takes SIGTERM for itself when it starts
     ):
         return run_all(
             jobs,

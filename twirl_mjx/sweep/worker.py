@@ -11,6 +11,7 @@ import signal
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -68,6 +69,24 @@ def claim_core() -> Iterator[int | None]:
     yield None
 
 
+@contextlib.contextmanager
+def interruptible() -> Iterator[None]:
+    """Let ``KeyboardInterrupt`` be raised here, by which Ray asks a worker to stop.
+
+    A sweep that was started in the background (``nohup make sweep &``) ignores SIGINT, and so do
+    its workers.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    old = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, old)
+
+
+@interruptible()
 def run_job(job: Job, *, pin: bool = True) -> Ending:
     """Run a job as a child process and wait for it.
 
