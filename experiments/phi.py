@@ -20,25 +20,27 @@ REDUCED = (
     {
         "preset": "cpu",
         "seeds": (0, 1),
-        "base": {  # at phi 0.5 and seed 0 the cells of the reduced ``shifts``
-            "variant": "twirl+weights",
-            "total_env_steps": 99_200,
-            "warmup_env_steps": 1600,
-            "droq.target_entropy": -12.0,
-            "eval.every": 32_000,
+        "base": {
+            "variant": "twirl",
+            "total_env_steps": 19_200,
+            "warmup_env_steps": 800,
+            "epoch_env_steps": 1600,
+            "env.num_envs": 32,
+            "droq.utd": 1.0,
+            "eval.every": 3200,
             "eval.episodes": 16,
+            "eval.final_episodes": 32,
         },
         "nominal": {"seed": 0},
         "axes": {
             "task": {"biped": {"task": "biped"}},
-            "shift": {name: SHIFTS[name] for name in ("icy", "gravity")},
+            "shift": {"icy": {"shift": "icy"}},
             "phi": PHI,
         },
     },
 )
 
 REDUCED_NOTE = (
-    "biped on ice and in low gravity only (of 2 tasks x 5 shifts), twirl+weights, 99k of 100k "
-    "transitions, UTD 0.5 of 20, target entropy -12 of -6, networks 2 x 128 of 2 x 256, 2 of 3 "
-    "seeds that share one nominal run"
+    "biped on ice only (of 2 tasks x 5 shifts), 19k of 100k transitions, UTD 1 of 20, networks "
+    "2 x 128 of 2 x 256, 2 of 3 seeds that share one nominal run, 32 of 100 final episodes"
 )
