@@ -298,12 +298,12 @@ class TrainConfig:
         check_range("shift_strength", self.shift_strength, 0.0, 2.0)
         check_range("seed", self.seed, 0, 2**32 - 1)  # 2**32 would be seed 0 again
         check_range("warmup_env_steps", self.warmup_env_steps, 0, INT32_MAX)
-        check_range("epoch_env_steps", self.epoch_env_steps, 1, 10**9)
+        countable = int(INT32_MAX // max(1.0, self.droq.utd))
+        check_range("epoch_env_steps", self.epoch_env_steps, 1, min(10**9, countable // 2))
         check_range("checkpoint_minutes", self.checkpoint_minutes, 0.0, 1e6)
         check_updates(self.droq.utd, self.env.num_envs, self.droq.updates_per_block)
         per_epoch = self.steps_per_epoch * self.env.num_envs
-        fits = INT32_MAX // max(1.0, self.droq.utd) - per_epoch
-        check_range("total_env_steps", self.total_env_steps, 1, int(fits))
+        check_range("total_env_steps", self.total_env_steps, 1, countable - per_epoch)
         if self.replay.capacity < self.env.num_envs:
             raise ValueError(
                 f"replay.capacity {self.replay.capacity} is below env.num_envs {self.env.num_envs}"

@@ -15,9 +15,9 @@ def main(argv: list[str]) -> int:
     options = parse_train(argv, "twirl collect")
     config = options.config
     check_source(config, options.preset)
-    source = pipeline.find_source(config, options.preset, options.runs, say)
     name = options.name or rundir.default_name(config, options.preset)
     run_dir = options.runs / rundir.check_name(name)
+    source = pipeline.find_source(config, options.preset, options.runs, say)
     with rundir.exclusive(run_dir):
         rundir.open_run(run_dir, config, source.identity)
         path = run_dir / "source.npz"
