@@ -19,28 +19,26 @@ GRID = (
 REDUCED = (
     {
         "preset": "cpu",
-        "seeds": (0, 1),
+        "seeds": (0, 1, 2),
         "base": {
-            "variant": "twirl",
-            "total_env_steps": 19_200,
-            "warmup_env_steps": 800,
-            "epoch_env_steps": 1600,
-            "env.num_envs": 32,
-            "droq.utd": 1.0,
-            "eval.every": 3200,
+            "variant": "twirl+weights",
+            "total_env_steps": 99_200,
+            "warmup_env_steps": 1600,
+            "droq.target_entropy": -12.0,
+            "eval.every": 32_000,
             "eval.episodes": 16,
-            "eval.final_episodes": 32,
         },
         "nominal": {"seed": 0},
         "axes": {
             "task": {"biped": {"task": "biped"}},
-            "shift": {"icy": {"shift": "icy"}},
+            "shift": {"icy": {"shift": "icy"}, "gravity": {"shift": "gravity"}},
             "phi": PHI,
         },
     },
 )
 
 REDUCED_NOTE = (
-    "biped on ice only (of 2 tasks x 5 shifts), 19k of 100k transitions, UTD 1 of 20, networks "
-    "2 x 128 of 2 x 256, 2 of 3 seeds that share one nominal run, 32 of 100 final episodes"
+    "biped on ice and under low gravity only (of 2 tasks x 5 shifts), from the weights of the nominal "
+    "run too, 99k of 100k transitions, UTD 0.5 of 20, target entropy -12 of -6, networks 2 x 128 of "
+    "2 x 256, 3 seeds that share one nominal run"
 )

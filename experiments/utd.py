@@ -22,14 +22,13 @@ REDUCED = (
         "preset": "cpu",
         "seeds": (0, 1),
         "base": {
-            "variant": "twirl",
-            "total_env_steps": 3200,
-            "warmup_env_steps": 400,
-            "epoch_env_steps": 400,
-            "env.num_envs": 16,
-            "eval.every": 800,
+            "variant": "twirl+weights",
+            "total_env_steps": 12_800,
+            "warmup_env_steps": 1600,
+            "epoch_env_steps": 640,
+            "droq.target_entropy": -12.0,
+            "eval.every": 3200,
             "eval.episodes": 16,
-            "eval.final_episodes": 32,
         },
         "nominal": {"seed": 0},
         "axes": {
@@ -41,6 +40,7 @@ REDUCED = (
 )
 
 REDUCED_NOTE = (
-    "biped on ice only (of 2 tasks x 5 shifts), 3.2k of 100k transitions, networks 2 x 128 of "
-    "2 x 256, 2 of 3 seeds that share one nominal run, 32 of 100 final episodes"
+    "biped on ice only (of 2 tasks x 5 shifts), from the weights of the nominal run too, 13k of 100k "
+    "transitions, target entropy -12 of -6, networks 2 x 128 of 2 x 256, 2 of 3 seeds that share one "
+    "nominal run"
 )
