@@ -38,7 +38,7 @@ REDUCED = (
 )
 
 REDUCED_NOTE = (
-    "biped on ice and under low gravity only (of 2 tasks x 5 shifts), from the weights of the nominal "
-    "run too, 99k of 100k transitions, UTD 0.5 of 20, target entropy -12 of -6, networks 2 x 128 of "
-    "2 x 256, 3 seeds that share one nominal run"
+    "biped on ice and under low gravity only (of 2 tasks x 5 shifts), with the weights of the "
+    "nominal run, 99k of 100k transitions, UTD 0.5 of 20, target entropy -12 of -6, networks "
+    "2 x 128 of 2 x 256, 3 seeds that share one nominal run"
 )

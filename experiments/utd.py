@@ -40,7 +40,7 @@ REDUCED = (
 )
 
 REDUCED_NOTE = (
-    "biped on ice only (of 2 tasks x 5 shifts), from the weights of the nominal run too, 13k of 100k "
-    "transitions, target entropy -12 of -6, networks 2 x 128 of 2 x 256, 2 of 3 seeds that share one "
-    "nominal run"
+    "biped on ice only (of 2 tasks x 5 shifts), with the weights of the nominal run, 13k of 100k "
+    "transitions, target entropy -12 of -6, networks 2 x 128 of 2 x 256, 2 of 3 seeds that share "
+    "one nominal run"
 )

@@ -23,7 +23,7 @@ CELLS = {
     ("shifts", False): 2 * 5 * 4 * 3,
     ("shifts", True): 2 * 5 * 3,
     ("phi", False): 2 * 5 * 4 * 3,
-    ("phi", True): 4 * 2,
+    ("phi", True): 2 * 4 * 3,
     ("utd", False): 2 * 5 * 4 * 3,
     ("utd", True): 4 * 2,
 }
