@@ -189,6 +189,13 @@ def test_ablation_has_one_line_and_one_point_per_value(tmp_path, write, rows_of)
     )
 
 
+def test_episodes_of_an_ablation_are_not_pooled_into_bars(tmp_path, write, episodes_of):
+    rows = episodes_of("biped", "icy", "twirl", 0)
+    table = read_table(write(tmp_path / "e.csv", tables.EPISODE_COLUMNS, rows))
+    assert list(plots.drawings("shifts_reduced", None, table))
+    assert not list(plots.drawings("phi_reduced", None, table))
+
+
 def test_unknown_names_are_refused_with_the_nearest(icy, tmp_path, write, rows_of):
     with pytest.raises(TableError, match="metric 'retrun'; nearest valid: 'return'"):
         plots.learning_curves(icy, "retrun")

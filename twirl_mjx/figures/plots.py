@@ -81,7 +81,7 @@ def drawings(
     """Yield the figures of one grid.
 
     Every grid has its main metric in the paper's style and with IQM; ``tasks`` and grids of your
-    own have curves of every headline metric; episode tables become bars.
+    own have curves of every headline metric; episode tables become bars, but for the ablations.
 
     Args:
         grid: Name of the grid; its first word says what kind it is.
@@ -98,10 +98,10 @@ def drawings(
             continue
         main = metric or main_metric(table)
         every = [m for m in shown_metrics(table, main) if _is_drawn(m, main)]
-        if table.is_episodes:
+        if kind in ("phi", "utd"):  # bars would pool the episodes of different values
+            wanted = [] if table.is_episodes else [("ablation", main)]
+        elif table.is_episodes:
             wanted = [("bars", name) for name in every]
-        elif kind in ("phi", "utd"):
-            wanted = [("ablation", main)]
         elif kind == "shifts":
             wanted = [("bars", main), ("curves", main)]
         else:
