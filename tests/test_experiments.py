@@ -122,6 +122,18 @@ def test_adaptation_starts_from_the_runs_of_the_tasks_grid(tmp_path: Path) -> No
         assert nominal <= tasks
 
 
+def test_reduced_phi_shares_its_cells_with_reduced_shifts(tmp_path: Path) -> None:
+    """Phi 0.5 is ``twirl+weights`` of seed 0, so that neither grid trains it again."""
+    phi, shifts = (
+        {c.name for c in plan.make_plan(load(name, reduced=True), tmp_path) if c.arm}
+        for name in ("phi", "shifts")
+    )
+    assert {name.rsplit("-", 1)[0] for name in phi & shifts} == {
+        "biped-icy-twirl_weights-s0",
+        "biped-gravity-twirl_weights-s0",
+    }
+
+
 @pytest.mark.parametrize(("name", "reduced"), BOTH)
 def test_arguments_give_the_config(name: str, reduced: bool, tmp_path: Path) -> None:
     cells = plan.make_plan(load(name, reduced=reduced), tmp_path)
