@@ -20,7 +20,7 @@ REDUCED = (
     {
         "preset": "cpu",
         "seeds": (0, 1, 2),
-        "base": {
+        "base": {  # at phi 0.5 and seed 0 the cells of the reduced ``shifts``
             "variant": "twirl+weights",
             "total_env_steps": 99_200,
             "warmup_env_steps": 1600,
@@ -31,7 +31,7 @@ REDUCED = (
         "nominal": {"seed": 0},
         "axes": {
             "task": {"biped": {"task": "biped"}},
-            "shift": {"icy": {"shift": "icy"}, "gravity": {"shift": "gravity"}},
+            "shift": {name: SHIFTS[name] for name in ("icy", "gravity")},
             "phi": PHI,
         },
     },

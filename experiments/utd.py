@@ -33,7 +33,7 @@ REDUCED = (
         "nominal": {"seed": 0},
         "axes": {
             "task": {"biped": {"task": "biped"}},
-            "shift": {"icy": {"shift": "icy"}},
+            "shift": {"icy": SHIFTS["icy"]},
             "utd": UTD,
         },
     },
