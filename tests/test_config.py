@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 import pytest
 
-from twirl_mjx import config_json
+from twirl_mjx.training import config_json
 from twirl_mjx.config import (
     SCRIPTED_SOURCES,
     SOURCE_OF,
@@ -23,7 +23,7 @@ from twirl_mjx.config import (
     TrainConfig,
 )
 from twirl_mjx.config import SHIFTS as SHIFT_NAMES
-from twirl_mjx.presets import PRESETS, make_config
+from twirl_mjx.training.presets import PRESETS, make_config
 from twirl_mjx.sim.dynamics import SHIFTS
 
 

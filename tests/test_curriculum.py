@@ -10,7 +10,7 @@ import pytest
 from twirl_mjx import cli
 from twirl_mjx.commands.curriculum import CHAINS, CurriculumOptions, plan
 from twirl_mjx.config import SHIFTS
-from twirl_mjx.presets import make_config
+from twirl_mjx.training.presets import make_config
 from twirl_mjx.training import rundir
 
 

@@ -10,18 +10,18 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from twirl_mjx.policies.learned import load_policy as load_policy
-    from twirl_mjx.tasks.adapters import to_brax as to_brax
-    from twirl_mjx.tasks.adapters import to_gymnasium as to_gymnasium
-    from twirl_mjx.tasks.registry import make as make
+    from twirl_mjx.worlds.adapters import to_brax as to_brax
+    from twirl_mjx.worlds.adapters import to_gymnasium as to_gymnasium
+    from twirl_mjx.worlds.make import make as make
 
 __version__ = "0.1.0"
 __all__ = ["load_policy", "make", "to_brax", "to_gymnasium"]
 
 _HOMES = {
-    "make": "twirl_mjx.tasks.registry",
+    "make": "twirl_mjx.worlds.make",
     "load_policy": "twirl_mjx.policies.learned",
-    "to_gymnasium": "twirl_mjx.tasks.adapters",
-    "to_brax": "twirl_mjx.tasks.adapters",
+    "to_gymnasium": "twirl_mjx.worlds.adapters",
+    "to_brax": "twirl_mjx.worlds.adapters",
 }
 
 

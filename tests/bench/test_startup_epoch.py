@@ -13,7 +13,7 @@ from twirl_mjx.bench import epoch, startup
 from twirl_mjx.bench.epoch import EpochBench
 from twirl_mjx.bench.startup import StartupBench
 from twirl_mjx.commands.options import parse_train
-from twirl_mjx.presets import PRESETS, make_config
+from twirl_mjx.training.presets import PRESETS, make_config
 from twirl_mjx.training.metrics import COLUMNS
 
 HEADER = ",".join(COLUMNS)

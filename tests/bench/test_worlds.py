@@ -11,7 +11,7 @@ import pytest
 
 from twirl_mjx.bench import worlds
 from twirl_mjx.bench.worlds import WorldsBench
-from twirl_mjx.tasks.registry import make
+from twirl_mjx.worlds.make import make
 
 
 @pytest.fixture(autouse=True)

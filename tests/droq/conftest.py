@@ -7,7 +7,7 @@ from collections.abc import Callable
 import jax
 import pytest
 
-from twirl_mjx.config import DroqConfig
+from twirl_mjx.droq.config import DroqConfig
 from twirl_mjx.types import Transition
 
 OBS_SIZE, ACTION_SIZE = 5, 2

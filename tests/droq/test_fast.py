@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from twirl_mjx.config import DroqConfig
+from twirl_mjx.droq.config import DroqConfig
 from twirl_mjx.droq import dropout, fast, fused, learner, packing, plain
 from twirl_mjx.droq.state import CriticState
 

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from twirl_mjx.config import DroqConfig
+from twirl_mjx.droq.config import DroqConfig
 from twirl_mjx.droq import fast, learner, plain
 from twirl_mjx.types import Transition
 

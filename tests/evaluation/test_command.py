@@ -11,9 +11,9 @@ import pytest
 
 from twirl_mjx.commands import evaluate
 from twirl_mjx.commands.render import config_of, name_of
-from twirl_mjx.config import TrainConfig
+from twirl_mjx.training.config import TrainConfig
 from twirl_mjx.policies.learned import PolicyFileError, PolicyHeader, save_policy
-from twirl_mjx.presets import make_config
+from twirl_mjx.training.presets import make_config
 from twirl_mjx.training import rundir
 
 

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from twirl_mjx.commands.evaluate import EvaluateOptions, on_course
-from twirl_mjx.presets import make_config
-from twirl_mjx.tasks.registry import make_env
+from twirl_mjx.training.presets import make_config
+from twirl_mjx.worlds.make import make_env
 
 
 def goals(options: EvaluateOptions) -> np.ndarray:

@@ -15,9 +15,9 @@ from twirl_mjx.evaluation.record import record_episode
 from twirl_mjx.evaluation.rollout import make_evaluate
 from twirl_mjx.evaluation.shifts import evaluate_shifts, scenes_of
 from twirl_mjx.policies.scripted import get_scripted
-from twirl_mjx.presets import make_config
-from twirl_mjx.tasks.registry import make_env
-from twirl_mjx.tasks.vector import EnvState
+from twirl_mjx.training.presets import make_config
+from twirl_mjx.worlds.make import make_env
+from twirl_mjx.worlds.vector import EnvState
 
 
 @pytest.fixture(scope="module")

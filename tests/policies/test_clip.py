@@ -16,10 +16,10 @@ from twirl_mjx.motion.clip import sample
 from twirl_mjx.motion.leap_checks import feed_forward, inverse_dynamics
 from twirl_mjx.policies.clip import ClipPolicy
 from twirl_mjx.policies.resolve import resolve_policy
-from twirl_mjx.presets import make_config
+from twirl_mjx.training.presets import make_config
 from twirl_mjx.sim import a1
 from twirl_mjx.tasks.imitate import load_clip, standing_time
-from twirl_mjx.tasks.registry import make_env
+from twirl_mjx.worlds.make import make_env
 
 STEP = 0.05
 

@@ -18,7 +18,7 @@ from twirl_mjx.motion.formats import read_clip, write_clip
 from twirl_mjx.policies.learned import PolicyFileError, PolicyHeader, load_policy, save_policy
 from twirl_mjx.policies.resolve import config_of_card, config_of_source, resolve_policy
 from twirl_mjx.policies.source import ObservingSource, OwnTaskSource
-from twirl_mjx.presets import make_config
+from twirl_mjx.training.presets import make_config
 
 
 def save(path: Path, task: str, size: int, **card: object) -> Path:

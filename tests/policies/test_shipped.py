@@ -10,7 +10,7 @@ import pytest
 
 from twirl_mjx.assets import asset_path
 from twirl_mjx.policies.learned import NumpyPolicy, load_policy
-from twirl_mjx.presets import make_config
+from twirl_mjx.training.presets import make_config
 from twirl_mjx.tasks.observations import layout_size
 from twirl_mjx.tasks.registry import make_task
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from twirl_mjx import config_json
+from twirl_mjx.training import config_json
 from twirl_mjx.sweep.plan import Cell
 from twirl_mjx.sweep.worker import Ending, Job, run_job
 

@@ -14,15 +14,15 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from twirl_mjx.config import TrainConfig
+from twirl_mjx.training.config import TrainConfig
 from twirl_mjx.sim import a1
 from twirl_mjx.sim.dynamics import Dynamics, make_dynamics
 from twirl_mjx.sim.scene import build_scene
 from twirl_mjx.tasks import base
 from twirl_mjx.tasks.base import Outcome, Task
 from twirl_mjx.tasks.biped import BipedState
-from twirl_mjx.tasks.registry import make
-from twirl_mjx.tasks.vector import EnvState
+from twirl_mjx.worlds.make import make
+from twirl_mjx.worlds.vector import EnvState
 
 
 class Worlds:

@@ -14,7 +14,7 @@ import twirl_mjx
 from twirl_mjx.config import DroqConfig, EnvConfig, StandConfig, TrainConfig
 from twirl_mjx.sim.dynamics import SHIFTS, make_dynamics
 from twirl_mjx.tasks.registry import TASKS, make
-from twirl_mjx.tasks.vector import EnvState
+from twirl_mjx.worlds.vector import EnvState
 
 
 @pytest.fixture(params=list(TASKS))

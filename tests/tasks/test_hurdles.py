@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from twirl_mjx.config import HurdlesConfig
-from twirl_mjx.evaluation.measures import MEASURES
-from twirl_mjx.presets import make_config
+from twirl_mjx.tasks.measures import MEASURES
+from twirl_mjx.training.presets import make_config
 from twirl_mjx.sim import a1
 from twirl_mjx.sim.dynamics import make_dynamics
 from twirl_mjx.sim.scene import build_scene, terrain_height

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from twirl_mjx.config import ImitateConfig, TrainConfig
 from twirl_mjx.motion.clip import Clip
 from twirl_mjx.motion.formats import write_clip
-from twirl_mjx.presets import make_config
+from twirl_mjx.training.presets import make_config
 from twirl_mjx.sim import a1
 from twirl_mjx.sim.dynamics import make_dynamics
 from twirl_mjx.sim.scene import CONTROL_DT, build_scene

@@ -6,8 +6,8 @@ import dataclasses
 
 import pytest
 
-from twirl_mjx.config import TrainConfig
-from twirl_mjx.presets import make_config
+from twirl_mjx.training.config import TrainConfig
+from twirl_mjx.training.presets import make_config
 
 
 @pytest.fixture(scope="session")

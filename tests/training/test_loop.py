@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from twirl_mjx.config import TrainConfig
+from twirl_mjx.training.config import TrainConfig
 from twirl_mjx.droq import learner as droq
 from twirl_mjx.policies.learned import load_policy
 from twirl_mjx.replay import ring

@@ -172,7 +172,7 @@ def test_every_metric_is_described() -> None:
 
 
 def test_every_measure_of_an_episode_is_a_metric() -> None:
-    from twirl_mjx.evaluation.measures import MEASURES
+    from twirl_mjx.tasks.measures import MEASURES
 
     for task, measures in MEASURES.items():
         assert set(measures) <= set(METRICS), task

@@ -13,14 +13,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from twirl_mjx.config import TrainConfig
+from twirl_mjx.training.config import TrainConfig
 from twirl_mjx.deploy.export import export_onnx
 from twirl_mjx.droq import learner as droq
 from twirl_mjx.policies.learned import load_policy
 from twirl_mjx.policies.resolve import resolve_policy
-from twirl_mjx.presets import make_config
+from twirl_mjx.training.presets import make_config
 from twirl_mjx.replay import dataset
-from twirl_mjx.tasks.registry import make_env
+from twirl_mjx.worlds.make import make_env
 from twirl_mjx.training import pipeline, rundir, weights
 from twirl_mjx.training.checkpoint import load_learner, load_replay
 from twirl_mjx.training.source import collect

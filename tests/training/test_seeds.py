@@ -11,13 +11,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from twirl_mjx.config import TrainConfig
+from twirl_mjx.training.config import TrainConfig
 from twirl_mjx.droq import learner as droq
 from twirl_mjx.policies.learned import load_policy
-from twirl_mjx.presets import make_config
+from twirl_mjx.training.presets import make_config
 from twirl_mjx.replay import ring
-from twirl_mjx.tasks.registry import make_env
-from twirl_mjx.tasks.vector import VectorEnv
+from twirl_mjx.worlds.make import make_env
+from twirl_mjx.worlds.vector import VectorEnv
 from twirl_mjx.training import loop, seeds, state
 from twirl_mjx.training.state import TrainState
 from twirl_mjx.types import Metrics

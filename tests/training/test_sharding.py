@@ -13,9 +13,9 @@ import textwrap
 import jax
 import pytest
 
-from twirl_mjx.config import TrainConfig
-from twirl_mjx.tasks.registry import make_env
-from twirl_mjx.tasks.vector import VectorEnv
+from twirl_mjx.training.config import TrainConfig
+from twirl_mjx.worlds.make import make_env
+from twirl_mjx.worlds.vector import VectorEnv
 from twirl_mjx.training import seeds, sharding, state
 from twirl_mjx.training.state import TrainState
 
@@ -25,8 +25,8 @@ CHILD = """
     import jax.numpy as jnp
     import numpy as np
     import pytest
-    from twirl_mjx.presets import make_config
-    from twirl_mjx.tasks.registry import make_env
+    from twirl_mjx.training.presets import make_config
+    from twirl_mjx.worlds.make import make_env
     from twirl_mjx.training import seeds, sharding, state
 
     assert jax.device_count() == 2

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from twirl_mjx.presets import make_config
+from twirl_mjx.training.presets import make_config
 from twirl_mjx.training import source_rules
 from twirl_mjx.training.source_rules import AtPath, NominalRun, RunOf, Scripted, source_of
 

@@ -19,16 +19,18 @@ import jax.numpy as jnp
 
 from twirl_mjx.bench.measure import Chain, Record, machine, progress, sample_rates, summary
 from twirl_mjx.checks import check_choice, check_range
-from twirl_mjx.config import TASKS, DroqConfig, TrainConfig
 from twirl_mjx.droq import learner as droq
-from twirl_mjx.presets import PRESETS, make_config
+from twirl_mjx.droq.config import DroqConfig
 from twirl_mjx.replay import mixed, ring
 from twirl_mjx.sim import actuation
 from twirl_mjx.sim.engine import resolve_engine
-from twirl_mjx.tasks.registry import make_env
-from twirl_mjx.tasks.vector import VectorEnv, make_transition
+from twirl_mjx.tasks.registry import TASKS
 from twirl_mjx.training import state as training
+from twirl_mjx.training.config import TrainConfig
+from twirl_mjx.training.presets import PRESETS, make_config
 from twirl_mjx.training.state import TrainState
+from twirl_mjx.worlds.make import make_env
+from twirl_mjx.worlds.vector import VectorEnv, make_transition
 
 REPEATS = 20
 """Times that a part runs in one compiled call."""
@@ -56,7 +58,7 @@ class EpochBench:
         Raises:
             ValueError: Unknown name, or a value out of range.
         """
-        check_choice("task", self.task, TASKS)
+        check_choice("task", self.task, TASKS.names())
         check_choice("preset", self.preset, PRESETS)
         check_range("seconds", self.seconds, 0.1, 3600.0)
 
@@ -64,7 +66,7 @@ class EpochBench:
     def config(self) -> TrainConfig:
         """The run: the preset's shapes with epochs short enough to be timed several times."""
         base = make_config(self.task, self.preset)
-        worlds = base.env.num_envs
+        worlds = base.num_envs
         steps = max(1, min(base.steps_per_epoch, 640 // max(1, base.updates_per_step)))
         return dataclasses.replace(
             base,
@@ -198,7 +200,7 @@ def measure(options: EpochBench) -> Record:
     """Time a whole epoch, then its parts."""
     record_machine = machine()
     config = options.config
-    env = make_env(config, training=True)
+    env = make_env(config)
     progress(f"bench epoch: compiling {options.task} with preset {options.preset}")
     init = functools.partial(training.init, config, env, source=None)
     state = jax.jit(init)(jax.random.key(0))
@@ -219,8 +221,8 @@ def measure(options: EpochBench) -> Record:
         "part": "epoch",
         "task": options.task,
         "preset": options.preset,
-        "engine": resolve_engine(config.env.engine),
-        "num_envs": config.env.num_envs,
+        "engine": resolve_engine(config.engine),
+        "num_envs": config.num_envs,
         "env_steps": config.steps_per_epoch * env.num_envs,
         "critic_updates": config.steps_per_epoch * config.updates_per_step,
         "env_steps_per_s": config.steps_per_epoch * env.num_envs / epoch_s,

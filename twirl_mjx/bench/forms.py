@@ -16,10 +16,11 @@ import numpy as np
 
 from twirl_mjx.bench.measure import Record, machine, progress
 from twirl_mjx.checks import check_choice, check_range
-from twirl_mjx.config import TASKS, TrainConfig
-from twirl_mjx.presets import PRESETS, make_config
-from twirl_mjx.tasks.registry import make_env
+from twirl_mjx.tasks.registry import TASKS
 from twirl_mjx.training import seeds
+from twirl_mjx.training.config import TrainConfig
+from twirl_mjx.training.presets import PRESETS, make_config
+from twirl_mjx.worlds.make import make_env
 
 FORMS: dict[str, dict[str, Any]] = {
     "plain": {"fast": False},
@@ -54,14 +55,14 @@ class FormsBench:
         Raises:
             ValueError: Unknown name, or a value out of range.
         """
-        check_choice("task", self.task, TASKS)
+        check_choice("task", self.task, TASKS.names())
         check_choice("preset", self.preset, PRESETS)
         if not self.forms:
             raise ValueError(f"forms is empty, expected some of {', '.join(tuple(FORMS)[1:])}")
         for form in self.forms:
             check_choice("form", form, tuple(FORMS)[1:])
         check_range("seeds", self.seeds, 2, 1000)
-        epoch = self.config("fast").steps_per_epoch * self.config("fast").env.num_envs
+        epoch = self.config("fast").steps_per_epoch * self.config("fast").num_envs
         check_range("env_steps", self.env_steps, QUARTERS * epoch, 10**9)
 
     def config(self, form: str) -> TrainConfig:
@@ -79,7 +80,7 @@ def returns_of(options: FormsBench, form: str) -> tuple[np.ndarray, int, float]:
         each seed, and the seconds it took.
     """
     config = options.config(form)
-    env = make_env(config, training=True)
+    env = make_env(config)
     states = seeds.init_seeds(config, env, range(options.seeds), None)
     epoch = seeds.compile_epoch_seeds(config, env)
     epochs = options.env_steps // (config.steps_per_epoch * env.num_envs)

@@ -29,8 +29,8 @@ from twirl_mjx.bench.measure import (
 )
 from twirl_mjx.bench.worker import Worker, pinning_missing
 from twirl_mjx.checks import check_range
-from twirl_mjx.config import DroqConfig
 from twirl_mjx.droq import learner as droq
+from twirl_mjx.droq.config import DroqConfig
 from twirl_mjx.replay import mixed, ring
 
 ROWS = 50_000

@@ -19,8 +19,8 @@ from pathlib import Path
 
 from twirl_mjx.bench.measure import Record, machine, progress
 from twirl_mjx.checks import check_choice, check_range
-from twirl_mjx.config import TASKS
-from twirl_mjx.presets import PRESETS, make_config
+from twirl_mjx.tasks.registry import TASKS
+from twirl_mjx.training.presets import PRESETS, make_config
 
 POLL_S = 0.05
 
@@ -46,7 +46,7 @@ class StartupBench:
         Raises:
             ValueError: Unknown name, or a value out of range.
         """
-        check_choice("task", self.task, TASKS)
+        check_choice("task", self.task, TASKS.names())
         check_choice("preset", self.preset, PRESETS)
         check_range("repeats", self.repeats, 1, 100)
         check_range("seconds", self.seconds, 1.0, 36_000.0)
@@ -54,7 +54,7 @@ class StartupBench:
 
 def command(options: StartupBench, runs: Path) -> list[str]:
     """Return the command line of the child: updates follow its second vector step."""
-    worlds = make_config(options.task, options.preset).env.num_envs
+    worlds = make_config(options.task, options.preset).num_envs
     settings = {
         "task": options.task,
         "preset": options.preset,

@@ -32,10 +32,10 @@ from twirl_mjx.bench.measure import (
     summary,
 )
 from twirl_mjx.checks import check_choice, check_range
-from twirl_mjx.config import TASKS
 from twirl_mjx.sim.engine import resolve_engine
-from twirl_mjx.tasks.registry import make
-from twirl_mjx.tasks.vector import EnvState, VectorEnv
+from twirl_mjx.tasks.registry import TASKS
+from twirl_mjx.worlds.make import make
+from twirl_mjx.worlds.vector import EnvState, VectorEnv
 
 STEPS = 20
 """Control steps in one compiled call."""
@@ -68,7 +68,7 @@ class WorldsBench:
         Raises:
             ValueError: A value is out of range.
         """
-        check_choice("task", self.task, TASKS)
+        check_choice("task", self.task, TASKS.names())
         check_range("seconds", self.seconds, 0.1, 3600.0)
         check_range("limit", self.limit, 0.0, 1e6)
         if not self.num_envs:

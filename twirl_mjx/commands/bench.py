@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from twirl_mjx.checks import check_choice, check_range
-from twirl_mjx.commands.options import json_text, parse, say
+from twirl_mjx.commands.console import json_text, parse, say
 from twirl_mjx.sweep import launch
 
 PARTS = ("learner", "startup", "epoch", "worlds")

@@ -12,7 +12,7 @@ import tyro
 
 from twirl_mjx.assets import asset_path
 from twirl_mjx.checks import check_choice
-from twirl_mjx.commands.options import parse, say
+from twirl_mjx.commands.console import parse, say
 from twirl_mjx.motion.leap_config import LeapConfig
 
 FRAME_DT = 0.025

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from twirl_mjx.commands.options import parse_train, say
-from twirl_mjx.config import SCRIPTED_SOURCES, SOURCE_OF, TrainConfig
-from twirl_mjx.presets import starts_from_nominal_run
+from twirl_mjx.commands.console import say
+from twirl_mjx.commands.options import parse_train
+from twirl_mjx.policies.resolve import SCRIPTED_SOURCES
+from twirl_mjx.tasks.imitate import ImitateOptions
 from twirl_mjx.training import pipeline, rundir
+from twirl_mjx.training.config import TrainConfig
+from twirl_mjx.training.presets import starts_from_nominal_run
 
 
 def main(argv: list[str]) -> int:
@@ -16,11 +19,14 @@ def main(argv: list[str]) -> int:
     config = options.config
     check_source(config, options.preset)
     name = options.name or rundir.default_name(config, options.preset)
-    run_dir = options.runs / rundir.check_name(name)
+    run_dir = rundir.RunDir(options.runs / rundir.check_name(name))
     source = pipeline.find_source(config, options.preset, options.runs, say)
-    with rundir.exclusive(run_dir):
-        rundir.open_run(run_dir, config, source.identity)
-        path = run_dir / "source.npz"
+    with run_dir.exclusive():
+        match run_dir.status(config, source.identity):
+            case rundir.Foreign(error) | rundir.Busy(error):
+                raise error
+        run_dir.open(config, source.identity)
+        path = run_dir.dataset
         before = _version(path)
         pipeline.source_data(config, run_dir, source, say)
         written = _version(path) != before
@@ -43,9 +49,9 @@ def check_source(config: TrainConfig, preset: str) -> None:
         ValueError: There is nothing to record; the message lists what can be named.
     """
     named = config.source not in ("auto", "train")
-    if named or config.task in SOURCE_OF or starts_from_nominal_run(config, preset):
+    if named or config.task_type.source or starts_from_nominal_run(config, preset):
         return
-    nearest = "clip" if config.task == "imitate" else "trot"
+    nearest = "clip" if isinstance(config.options, ImitateOptions) else "trot"
     raise ValueError(
         f"task {config.task} has no source policy of its own, so --source {config.source} finds"
         f" nothing to record: name one of {', '.join(SCRIPTED_SOURCES)}, a run directory or a"

@@ -4,61 +4,30 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated
 
 import tyro
 
 from twirl_mjx.checks import check_choice
-from twirl_mjx.commands.options import default_preset, parse, say
-from twirl_mjx.config import SHIFTS, TrainConfig
-from twirl_mjx.presets import PRESETS
+from twirl_mjx.commands.console import parse, say
+from twirl_mjx.commands.options import default_preset
+from twirl_mjx.sim.dynamics import SHIFTS
 from twirl_mjx.sweep.grid import configure
+from twirl_mjx.tasks.registry import TASKS
+from twirl_mjx.tasks.task import Link
 from twirl_mjx.training import pipeline, rundir
+from twirl_mjx.training.config import TrainConfig
+from twirl_mjx.training.presets import PRESETS
 
 ADAPTATION_ENV_STEPS = 100_000
 """Transitions of an adaptation run (paper, section "Transfer to New Environments")."""
-
-POLISH = {
-    "variant": "twirl+weights",
-    "droq.target_entropy": -12.0,
-    "droq.learning_rate": 1e-4,
-}
-"""Less exploration noise and smaller steps, for a skill that is there already."""
-
-CHAINS: dict[str, tuple[tuple[str, dict[str, Any]], ...]] = {
-    "biped": (
-        ("stand", {"task": "stand"}),
-        (
-            "walk",
-            {
-                "task": "biped",
-                "variant": "twirl+weights",
-                "biped.distance_reward": "speed",
-                "biped.distance_weight": 4.0,
-                "env.train_episode_length": 200,
-                "droq.target_entropy": -12.0,
-            },
-        ),
-        ("biped", {"task": "biped"} | POLISH),
-    ),
-    "hurdles": (
-        ("imitate", {"task": "imitate"}),
-        ("hurdles", {"task": "hurdles"}),
-        ("polish", {"task": "hurdles", "hurdles.max_gap": 3.7} | POLISH),
-    ),
-}
-"""Per target task: name and settings of every link, on top of the preset. ``walk`` is ``biped``
-with an easier reward: its distance term is graded and four times as large, because leaning towards
-the goal earns little in the paper's reward as long as it costs balance. ``polish`` goes on with
-TWiRL's networks and its own experience, and with gaps up to a little more than the 3.6 m between
-the hurdles of the paper's tests: run-ups of that length do not occur in the task itself."""
 
 
 @dataclasses.dataclass(frozen=True)
 class CurriculumOptions:
     """Train a chain unattended: easier tasks first, the target task, then every dynamics shift."""
 
-    task: Literal["biped", "hurdles"] = "biped"
+    task: str = TrainConfig.task
     """Target task at the heart of the chain."""
     preset: Annotated[str, tyro.conf.arg(help="paper, cpu or debug")] = ""
     """Settings; cpu without an accelerator, else paper."""
@@ -66,8 +35,17 @@ class CurriculumOptions:
     """Seed of every run."""
     runs: Path = Path("runs")
     """Folder of all runs."""
-    shifts: tuple[str, ...] = SHIFTS[1:]
+    shifts: tuple[str, ...] = tuple(SHIFTS)[1:]
     """Shifts to adapt to."""
+
+
+def chain_of(task: str) -> tuple[Link, ...]:
+    """Return the runs that lead to a task: its own chain, else those of its sources and its own."""
+    kind = TASKS.get(task)
+    if kind.chain:
+        return kind.chain
+    before = chain_of(kind.source) if kind.source else ()
+    return (*before, Link(task, {"task": task}))
 
 
 def plan(options: CurriculumOptions, preset: str) -> list[tuple[str, TrainConfig]]:
@@ -76,7 +54,8 @@ def plan(options: CurriculumOptions, preset: str) -> list[tuple[str, TrainConfig
     All shifts start from the run of the target task.
     """
     links: list[tuple[str, TrainConfig]] = []
-    for name, settings in CHAINS[options.task]:
+    task = TASKS.admit(options.task)
+    for name, settings in chain_of(task):
         source = {"source": str(options.runs / links[-1][0])} if links else {}
         config = configure(preset, settings | source | {"seed": options.seed}, f"link {name}")
         chained = f"{name}-chain-{preset}-s{options.seed}"
@@ -91,7 +70,7 @@ def plan(options: CurriculumOptions, preset: str) -> list[tuple[str, TrainConfig
             source=str(options.runs / target),
             total_env_steps=budget,
         )
-        links.append((f"{options.task}-{shift}-chain-{preset}-s{options.seed}", adapted))
+        links.append((f"{task}-{shift}-chain-{preset}-s{options.seed}", adapted))
     return links
 
 
@@ -101,7 +80,7 @@ def main(argv: list[str]) -> int:
     preset = options.preset or default_preset()
     check_choice("preset", preset, PRESETS)
     for shift in options.shifts:
-        check_choice("shift", shift, SHIFTS[1:])
+        check_choice("shift", shift, tuple(SHIFTS)[1:])
     links = plan(options, preset)
     for number, (name, config) in enumerate(links, 1):
         say(f"link {number} of {len(links)}: {name}")

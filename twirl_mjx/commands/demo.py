@@ -9,9 +9,8 @@ from pathlib import Path
 
 from twirl_mjx.assets import asset_path
 from twirl_mjx.checks import check_range
-from twirl_mjx.commands.options import parse, say
+from twirl_mjx.commands.console import parse, say
 from twirl_mjx.commands.render import FILM_SECONDS, RenderOptions, config_of, film
-from twirl_mjx.config import TASKS
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,10 +40,13 @@ def main(argv: list[str], set_up: Callable[[bool], None]) -> int:
     check_range("episodes", options.episodes, 1, 100_000)
     check_range("seconds", options.seconds, *FILM_SECONDS)
     folder = asset_path("policies")
-    found = [folder / f"{task}.npz" for task in TASKS if (folder / f"{task}.npz").is_file()]
+    set_up(options.film)
+    from twirl_mjx.tasks.registry import TASKS
+
+    shipped = [folder / f"{task}.npz" for task in TASKS.names()]
+    found = [path for path in shipped if path.is_file()]
     if not found:
         raise FileNotFoundError(f"no policy in {folder}: train one with `twirl train`")
-    set_up(options.film)
     for path in found:
         _show(path, options)
     return 0
@@ -53,20 +55,16 @@ def main(argv: list[str], set_up: Callable[[bool], None]) -> int:
 def _show(path: Path, options: DemoOptions) -> None:
     import jax
 
-    from twirl_mjx.evaluation.measures import episode_means
-    from twirl_mjx.evaluation.rollout import make_evaluate
+    from twirl_mjx.evaluation.rollout import evaluate_policy
     from twirl_mjx.policies.resolve import resolve_policy
-    from twirl_mjx.tasks.registry import make_env
+    from twirl_mjx.tasks.measures import episode_means
+    from twirl_mjx.worlds.make import make_env
 
     began = time.monotonic()
     config = config_of(str(path), None)
-    policy = resolve_policy(str(path), config).policy
-
-    def act(params: object, memory: object, state: object, key: jax.Array) -> tuple:
-        return policy.act(memory, state, key)
-
     env = make_env(config, num_envs=options.episodes)
-    values = make_evaluate(env, policy.init, act)(None, jax.random.key(options.seed))
+    evaluate = evaluate_policy(env, resolve_policy(str(path), config).policy)
+    values = evaluate(jax.random.key(options.seed))
     means = ", ".join(f"{name} {value:.3g}" for name, value in episode_means(values).items())
     say(f"{path.stem}: {means}")
     if options.film:

@@ -15,14 +15,15 @@ from rich.console import Console
 from rich.table import Table
 
 from twirl_mjx.checks import check_choice, check_range
-from twirl_mjx.commands.options import parse, say
+from twirl_mjx.commands.console import say
+from twirl_mjx.commands.options import Overrides, parse_in_tasks, with_overrides
 from twirl_mjx.commands.render import config_of, name_of
-from twirl_mjx.config import SHIFTS, TrainConfig
 from twirl_mjx.evaluation.shifts import evaluate_shifts
 from twirl_mjx.figures.statistics import bootstrap
-from twirl_mjx.policies.resolve import ResolvedPolicy, resolve_policy
-from twirl_mjx.tasks.bands import MIN_GAP
-from twirl_mjx.training.loop import EVAL_COLUMNS
+from twirl_mjx.policies.resolve import Source, resolve_policy
+from twirl_mjx.sim.dynamics import SHIFTS
+from twirl_mjx.training.rundir import EVAL_COLUMNS
+from twirl_mjx.worlds.config import WorldConfig
 
 MEDIANS = ("min_distance",)
 """Measures of which the table shows the median, as the paper does: goals lie at all distances."""
@@ -30,26 +31,22 @@ MEDIANS = ("min_distance",)
 
 @dataclasses.dataclass(frozen=True)
 class EvaluateOptions:
-    """Evaluate policies across dynamics conditions, on one fixed course unless told otherwise."""
+    """Evaluate policies across dynamics conditions, on one fixed course unless told otherwise.
+
+    Options of the task (`--biped.goal-distance 1`) are those of the policy's config by default.
+    """
 
     policies: Annotated[tuple[str, ...], tyro.conf.Positional]
     """Run directories, policy files (.npz, .onnx) or scripted names (trot, bound, zero,
     random, clip)."""
     task: str | None = None
     """Task to act in; the one a policy was trained for by default."""
-    shifts: tuple[str, ...] = SHIFTS
+    shifts: tuple[str, ...] = tuple(SHIFTS)
     """Conditions."""
     strength: float = 1.0
     """Strength of every shift: 0 nominal, 1 the paper's value."""
     course: Literal["fixed", "random"] = "fixed"
     """One course for all episodes, or goals and hurdles drawn as in training without a shift."""
-    goal_distance: float | None = None
-    """m, distance of every goal of ``biped``; that of the policy's config by default."""
-    hurdle_gap: float | None = None
-    """m, gap between all hurdles of ``hurdles``; that of the policy's config by default."""
-    hurdle_gaps: tuple[float, float] | None = None
-    """m, smallest and largest gap on the random course of ``hurdles``; those of the policy's config
-    by default."""
     engine: Literal["auto", "mjx", "native"] = "auto"
     """Physics engine: MJX, or C MuJoCo in threads; auto as in training."""
     episodes: int = 100
@@ -71,23 +68,23 @@ class Candidate:
     """What the command line calls it."""
     run: str
     """What the table calls it."""
-    config: TrainConfig
+    config: WorldConfig
     """Task, course and options it is scored under."""
-    found: ResolvedPolicy
+    found: Source
     """The policy."""
 
 
 def main(argv: list[str]) -> int:
     """Evaluate, print a table per policy and write every episode."""
-    options = parse(EvaluateOptions, argv, "twirl evaluate")
+    options, overrides = parse_in_tasks(EvaluateOptions, argv, "twirl evaluate")
     if not options.policies:
         raise ValueError("name at least one policy: a run directory, a policy file or a script")
     check_range("episodes", options.episodes, 1, 1_000_000)
     for shift in options.shifts:
-        check_choice("shift", shift, SHIFTS)
+        check_choice("shift", shift, tuple(SHIFTS))
     out = options.out or Path("runs", f"evaluation-{time.strftime('%Y%m%d-%H%M%S')}.csv")
     check_outputs(out, options.figure)
-    candidates = resolve_all(options)
+    candidates = resolve_all(options, overrides)
     rows: list[list[object]] = []
     for candidate in candidates:
         rows += _evaluate_one(candidate, options)
@@ -112,12 +109,12 @@ def check_outputs(out: Path, figure: Path | None) -> None:
         )
 
 
-def resolve_all(options: EvaluateOptions) -> list[Candidate]:
+def resolve_all(options: EvaluateOptions, overrides: Overrides) -> list[Candidate]:
     """Return all policies, ready to act, before the first of them is evaluated.
 
     Raises:
         FileNotFoundError: Nothing to load under a name.
-        ValueError: A file that is no policy, a course of another task, or two policies that the
+        ValueError: A file that is no policy, options of another task, or two policies that the
             table could not tell apart.
     """
     candidates: dict[str, Candidate] = {}
@@ -128,7 +125,9 @@ def resolve_all(options: EvaluateOptions) -> list[Candidate]:
                 f"{candidates[run].given} and {given} would both be {run!r} in the table:"
                 " evaluate them one by one with --out, or copy one to another name"
             )
-        config = on_course(config_of(given, options.task), options)
+        config = with_overrides(config_of(given, options.task), overrides)
+        config = dataclasses.replace(config, course=options.course, engine=options.engine)
+        config.make_task()  # refuses options that only the task can judge
         candidates[run] = Candidate(given, run, config, resolve_policy(given, config))
     return list(candidates.values())
 
@@ -140,36 +139,6 @@ def write_rows(path: Path, rows: list[list[object]]) -> None:
     with partial.open("w", newline="") as file:
         csv.writer(file, lineterminator="\n").writerows([EVAL_COLUMNS, *rows])
     partial.replace(path)
-
-
-def on_course(config: TrainConfig, options: EvaluateOptions) -> TrainConfig:
-    """Return the config with the goals, hurdles and engine that the options ask for.
-
-    Raises:
-        ValueError: A distance out of range, or of another task.
-    """
-    of_task = {"goal_distance": "biped", "hurdle_gap": "hurdles", "hurdle_gaps": "hurdles"}
-    for name, task in of_task.items():
-        if getattr(options, name) is not None and config.task != task:
-            raise ValueError(f"{name} is an option of task {task}, not of {config.task}")
-    biped, hurdles = config.biped, config.hurdles
-    if (goal := options.goal_distance) is not None:
-        check_range("goal_distance", goal, 0.01, 100.0)
-        biped = dataclasses.replace(
-            biped, fixed_goal=(goal, 0.0), goal_min_radius=goal, goal_max_radius=goal
-        )
-    if (gap := options.hurdle_gap) is not None:
-        check_range("hurdle_gap", gap, MIN_GAP, 100.0)
-        hurdles = dataclasses.replace(hurdles, fixed_gap=gap, min_gap=gap, max_gap=gap)
-    if (gaps := options.hurdle_gaps) is not None:
-        if options.course != "random" or options.hurdle_gap is not None:
-            raise ValueError(
-                f"hurdle_gaps {gaps[0]} {gaps[1]} are drawn on the random course only"
-                " (nearest: add --course random, and leave --hurdle-gap out)"
-            )
-        hurdles = dataclasses.replace(hurdles, min_gap=gaps[0], max_gap=gaps[1])
-    env = dataclasses.replace(config.env, course=options.course, engine=options.engine)
-    return dataclasses.replace(config, biped=biped, hurdles=hurdles, env=env)
 
 
 def _evaluate_one(candidate: Candidate, options: EvaluateOptions) -> list[list[object]]:
@@ -190,7 +159,7 @@ def _evaluate_one(candidate: Candidate, options: EvaluateOptions) -> list[list[o
     say(f"{conditions} conditions x {options.episodes} episodes in {wall:.1f} s, with compilation")
     card = getattr(getattr(found.loaded, "header", None), "card", {})
     variant = card.get("variant", "scripted") if found.loaded else "scripted"
-    trained = [variant, card.get("seed", config.seed), card.get("env_steps", 0)]
+    trained = [variant, card.get("seed", 0), card.get("env_steps", 0)]
     return [
         [candidate.run, config.task, shift, *trained, episode, measure, f"{float(value):.9g}"]
         for shift, measures in values.items()

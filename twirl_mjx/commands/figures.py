@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from pathlib import Path
 
-from twirl_mjx.commands.options import parse, say
+from twirl_mjx.commands.console import parse, say
 
 
 @dataclasses.dataclass(frozen=True)

@@ -1,16 +1,24 @@
-"""Parsing shared by the commands: presets first, then every field as a documented option."""
+"""Options with those of tasks among them: presets first, then every field as an option."""
 
 from __future__ import annotations
 
 import argparse
 import dataclasses
+import itertools
+import re
+import typing
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
 
-from twirl_mjx.config import TrainConfig
-from twirl_mjx.presets import make_config
+from twirl_mjx.commands.console import parse
+from twirl_mjx.plugins import is_reference
+from twirl_mjx.tasks.registry import TASKS
+from twirl_mjx.training.config import TrainConfig
+from twirl_mjx.training.presets import make_config
+from twirl_mjx.worlds.config import WorldConfig
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,13 +44,6 @@ def default_preset() -> str:
     return "cpu" if jax.default_backend() == "cpu" else "paper"
 
 
-def parse[T](kind: type[T], argv: list[str], prog: str, default: T | None = None) -> T:
-    """Parse a command's options with tyro; a wrong one is refused with the nearest valid."""
-    if default is None:
-        return tyro.cli(kind, args=argv, prog=prog)
-    return tyro.cli(kind, args=argv, prog=prog, default=default)
-
-
 def parse_train(argv: list[str], prog: str = "twirl train") -> TrainOptions:
     """Parse training options: ``--task`` and ``--preset`` choose the defaults of the others.
 
@@ -50,27 +51,109 @@ def parse_train(argv: list[str], prog: str = "twirl train") -> TrainOptions:
         ValueError: Unknown task or preset, or a value out of range.
     """
     first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    first.add_argument("--task", default="biped")
+    first.add_argument("--task", default=TrainConfig.task)
     first.add_argument("--preset", default=None)
     first.add_argument("--runs", default="runs")
     known, _ = first.parse_known_args(argv)
     preset = known.preset or default_preset()
-    default = TrainOptions(
-        preset=preset,
-        name=None,
-        runs=Path(known.runs),
-        config=make_config(known.task, preset),
+    config = make_config(known.task, preset)
+    shown = _shown(config)
+    kind = dataclasses.make_dataclass(
+        TrainOptions.__name__,
+        [("config", Annotated[type(shown), tyro.conf.arg(name="")])],
+        bases=(TrainOptions,),
+        frozen=True,
+        namespace={"__doc__": TrainOptions.__doc__},
     )
-    return parse(TrainOptions, argv, prog, default)
+    found: Any = parse(kind, argv, prog, kind(preset, None, Path(known.runs), shown))
+    values = {f.name: getattr(found.config, f.name) for f in dataclasses.fields(TrainConfig)}
+    return TrainOptions(found.preset, found.name, found.runs, TrainConfig(**values))
 
 
-def say(text: str) -> None:
-    """Print one line at once."""
-    print(text, flush=True)
+def _shown(config: TrainConfig) -> TrainConfig:
+    """Return a config of a class that shows the options of its task under the task's name."""
+    sections = [("options", config.task, config.options)]
+    if config.task_type.source:
+        sections.append(("source_options", config.task_type.source, config.source_options))
+    fields: list[Any] = [
+        (field, Annotated[type(value), tyro.conf.arg(name=name)], dataclasses.field(default=value))
+        for field, name, value in sections
+    ]
+    hidden = {"uses", "source_options"} - {field for field, _, _ in fields}
+    fields += [
+        (name, Annotated[Any, tyro.conf.Suppress], dataclasses.field(default=getattr(config, name)))
+        for name in hidden
+    ]
+    kind = dataclasses.make_dataclass(
+        TrainConfig.__name__, fields, bases=(TrainConfig,), frozen=True
+    )
+    return kind(**{f.name: getattr(config, f.name) for f in dataclasses.fields(TrainConfig)})
 
 
-def json_text(record: Any) -> str:
-    """Return a record as one JSON document for machines."""
-    import json
+Overrides = dict[str, dict[str, Any]]
+"""Task -> option -> value, for the options that were given."""
 
-    return json.dumps(record, indent=2, sort_keys=True, allow_nan=True)
+
+def parse_in_tasks[T](kind: type[T], argv: list[str], prog: str) -> tuple[T, Overrides]:
+    """Parse a command that also takes options of tasks, ``--biped.goal-distance 1`` say.
+
+    Returns:
+        The command's own options, and those of tasks that were given.
+
+    Raises:
+        ValueError: A task of a user's file that cannot be loaded.
+    """
+    for before, word in itertools.pairwise(argv):
+        if before == "--task" and is_reference(word):
+            TASKS.admit(word)
+    tasks = [name for name in TASKS.names() if name not in _field_names(kind)]
+    asked = {match[1] for word in argv if (match := re.match(r"--([a-z][a-z0-9_]*)\.", word))}
+    if not {"-h", "--help"} & set(argv):  # a section that is not asked for costs time to build
+        tasks = [name for name in tasks if name in asked]
+    fields: list[Any] = []
+    for name in tasks:
+        some = _all_optional(TASKS.get(name).Options)
+        fields.append((name, some, dataclasses.field(default=some())))
+    shown = dataclasses.make_dataclass(
+        kind.__name__, fields, bases=(kind,), frozen=True, namespace={"__doc__": kind.__doc__}
+    )
+    found: Any = parse(shown, argv, prog)
+    own = kind(**{name: getattr(found, name) for name in _field_names(kind)})
+    given = {
+        name: {k: v for k, v in vars(getattr(found, name)).items() if v is not None}
+        for name in tasks
+    }
+    return own, {name: values for name, values in given.items() if values}
+
+
+def _field_names(kind: type) -> list[str]:
+    return [field.name for field in dataclasses.fields(kind)]
+
+
+def _all_optional(kind: type) -> type:
+    """Return a form of an options class in which every field may be left out (None)."""
+    hints = typing.get_type_hints(kind)
+    fields: list[Any] = [
+        (name, hints[name] | None, dataclasses.field(default=None)) for name in _field_names(kind)
+    ]
+    return dataclasses.make_dataclass(
+        kind.__name__,
+        fields,
+        bases=(kind,),
+        frozen=True,
+        namespace={"__doc__": kind.__doc__, "__post_init__": lambda self: None},
+    )
+
+
+def with_overrides[W: WorldConfig](config: W, overrides: Mapping[str, dict[str, Any]]) -> W:
+    """Return worlds with options of their task replaced.
+
+    Raises:
+        ValueError: Options of another task, or out of range.
+    """
+    for task, values in overrides.items():
+        if task != config.task:
+            name = next(iter(values))
+            raise ValueError(f"{task}.{name} is an option of task {task}, not of {config.task}")
+    values = overrides.get(config.task, {})
+    return dataclasses.replace(config, options=dataclasses.replace(config.options, **values))

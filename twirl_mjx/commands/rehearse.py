@@ -8,7 +8,7 @@ from typing import Annotated
 
 import tyro
 
-from twirl_mjx.commands.options import parse, say
+from twirl_mjx.commands.console import parse, say
 from twirl_mjx.deploy.rehearsal import rehearse
 from twirl_mjx.deploy.robot import RehearsalConfig
 

@@ -11,15 +11,13 @@ from typing import TYPE_CHECKING, Annotated
 import numpy as np
 import tyro
 
-from twirl_mjx.checks import check_choice, check_range
-from twirl_mjx.commands.options import parse, say
-from twirl_mjx.config import SCRIPTED_SOURCES, SHIFTS, TrainConfig
+from twirl_mjx.checks import check_range
+from twirl_mjx.commands.console import say
 from twirl_mjx.policies.learned import BEST_POLICY, LAST_POLICY, load_policy
-from twirl_mjx.presets import make_config
-from twirl_mjx.training import rundir
 
 if TYPE_CHECKING:
     from twirl_mjx.evaluation.record import Recording
+    from twirl_mjx.worlds.config import WorldConfig
 
 FILM_SECONDS = (0.1, 3600.0)
 """s, shortest and longest film that can be asked for; an episode may end before."""
@@ -47,15 +45,13 @@ class RenderOptions:
     """Path without ending; <run>/episode, or runs/<policy>-<task>, by default."""
 
     def __post_init__(self) -> None:
-        """Check the numbers and the name of the shift.
+        """Check the numbers.
 
         Raises:
-            ValueError: A value is out of range, or the shift is unknown.
+            ValueError: A value is out of range.
         """
         check_range("seconds", self.seconds, *FILM_SECONDS)
         check_range("panels", self.panels, 1, MAX_PANELS)
-        if self.shift is not None:
-            check_choice("shift", self.shift, SHIFTS)
 
 
 def main(argv: list[str], set_up: Callable[[bool], None]) -> int:
@@ -65,9 +61,11 @@ def main(argv: list[str], set_up: Callable[[bool], None]) -> int:
         argv: Options.
         set_up: Gets whether anything is drawn, before the simulation is imported.
     """
-    options = parse(RenderOptions, argv, "twirl render")
-    set_up(True)
-    config = config_of(options.policy, options.task)
+    set_up(not {"-h", "--help"} & set(argv))
+    from twirl_mjx.commands.options import parse_in_tasks, with_overrides
+
+    options, overrides = parse_in_tasks(RenderOptions, argv, "twirl render")
+    config = with_overrides(config_of(options.policy, options.task), overrides)
     if options.shift is not None:
         config = dataclasses.replace(config, shift=options.shift)
     path = Path(options.policy)
@@ -76,7 +74,7 @@ def main(argv: list[str], set_up: Callable[[bool], None]) -> int:
     return 0
 
 
-def film(config: TrainConfig, options: RenderOptions, stem: Path) -> Path:
+def film(config: WorldConfig, options: RenderOptions, stem: Path) -> Path:
     """Write ``<stem>.mp4`` and ``<stem>.png``; return the strip's path."""
     from twirl_mjx.deploy.render import render_episode
     from twirl_mjx.evaluation.record import record_episode, scene_model
@@ -84,7 +82,7 @@ def film(config: TrainConfig, options: RenderOptions, stem: Path) -> Path:
     from twirl_mjx.sim.scene import CONTROL_DT
 
     found = resolve_policy(options.policy, config)
-    steps = min(config.env.episode_length, round(options.seconds / CONTROL_DT))
+    steps = min(config.episode_length, round(options.seconds / CONTROL_DT))
     recording = record_episode(config, found.policy, seed=options.seed, steps=steps)
     stem.parent.mkdir(parents=True, exist_ok=True)
     video, strip = render_episode(
@@ -93,25 +91,19 @@ def film(config: TrainConfig, options: RenderOptions, stem: Path) -> Path:
         stem,
         frame_dt=CONTROL_DT,
         panels=options.panels,
-        goals=recording.goals if config.task == "biped" else None,
+        goals=recording.goals if config.task_type.shows_goal else None,
         captions=captions(config, recording),
     )
     say(f"return {recording.reward.sum():.1f} in {len(recording.reward)} steps; {video}, {strip}")
     return strip
 
 
-def captions(config: TrainConfig, recording: Recording) -> list[list[str]]:
+def captions(config: WorldConfig, recording: Recording) -> list[list[str]]:
     """Return the text lines of every frame."""
     from twirl_mjx.sim import look
     from twirl_mjx.sim.dynamics import make_dynamics
     from twirl_mjx.sim.scene import CONTROL_DT
 
-    shown = {
-        "stand": ("cosine",),
-        "biped": ("cosine", "goal_distance"),
-        "imitate": ("tracking",),
-        "hurdles": ("hurdles_passed",),
-    }[config.task]
     total = np.cumsum(recording.reward)
     shift = look.describe(
         config.shift, make_dynamics(config.shift, config.shift_strength), recording.leg_strength
@@ -121,36 +113,41 @@ def captions(config: TrainConfig, recording: Recording) -> list[list[str]]:
         [
             f"{title}  {CONTROL_DT * (t + 1):5.2f} s",
             f"return {total[t]:.0f}  "
-            + "  ".join(f"{k} {recording.metrics[k][t]:.2f}" for k in shown),
+            + "  ".join(f"{k} {recording.metrics[k][t]:.2f}" for k in config.task_type.caption),
         ]
         for t in range(len(total))
     ]
 
 
-def config_of(policy: str, task: str | None) -> TrainConfig:
-    """Return the config to show a policy under.
+def config_of(policy: str, task: str | None) -> WorldConfig:
+    """Return the worlds to show a policy in.
 
-    A run directory has its own. A policy file is shown under the paper's of its task, with the
-    task options that it was trained with where its card has them, and in a task that is not its
-    own under the paper's of that task, as scripts are.
+    A run directory has its own. A policy file is shown in those of its task, with the task
+    options that it was trained with where its card has them, and in a task that is not its
+    own under the paper's options of that task, as scripts are.
 
     Raises:
         FileNotFoundError: Nothing to load there.
         PolicyFileError: The file is no policy, or of a task or with options unknown here.
         ValueError: The policy does not say its task and none is given.
     """
-    path = Path(policy)
-    if (path / rundir.CONFIG_NAME).is_file():
-        config = rundir.read_config(path)
-        return config if task is None else dataclasses.replace(config, task=task)
-    header = None if policy in SCRIPTED_SOURCES else load_policy(path).header
-    if header is not None and task in (None, header.task):
-        from twirl_mjx.policies.resolve import config_of_card
+    from twirl_mjx.policies.resolve import SCRIPTED_SOURCES, config_of_card
+    from twirl_mjx.tasks.registry import TASKS
+    from twirl_mjx.training.rundir import RunDir
+    from twirl_mjx.worlds.config import WorldConfig, in_task
 
+    run_dir, name = RunDir(policy), None if task is None else TASKS.admit(task)
+    if run_dir.config.is_file():
+        config = run_dir.read_config().evaluation
+        if name in (None, config.task):
+            return config
+        return in_task(config, name, TASKS.get(name).paper_options())
+    header = None if policy in SCRIPTED_SOURCES else load_policy(policy).header
+    if header is not None and name in (None, header.task):
         return config_of_card(header, policy)
-    if task is None:
+    if name is None:
         raise ValueError(f"{policy} does not say its task: give --task")
-    return make_config(task)
+    return WorldConfig(task=name, options=TASKS.get(name).paper_options())
 
 
 def name_of(policy: str) -> str:
@@ -159,12 +156,15 @@ def name_of(policy: str) -> str:
     A run directory and its ``policy.npz`` have the directory's name, its other policy files a
     longer one (``NAME-policy_last``); any other file has its own without the ending.
     """
+    from twirl_mjx.policies.resolve import SCRIPTED_SOURCES
+    from twirl_mjx.training.rundir import RunDir
+
     if policy in SCRIPTED_SOURCES:
         return policy
     path = Path(os.path.abspath(policy))  # ".." and "." have no name
     if path.is_dir():
         return path.name
-    of_run = (path.parent / rundir.CONFIG_NAME).is_file() and path.match("policy*.npz")
+    of_run = RunDir(path.parent).config.is_file() and path.match("policy*.npz")
     if of_run or path.name in (BEST_POLICY, LAST_POLICY):
         folder = path.parent.name
         return folder if path.name == BEST_POLICY else f"{folder}-{path.stem}"

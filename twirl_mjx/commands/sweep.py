@@ -12,7 +12,7 @@ import tyro
 from rich.console import Console
 
 from twirl_mjx.checks import check_range
-from twirl_mjx.commands.options import parse, say
+from twirl_mjx.commands.console import parse, say
 from twirl_mjx.sweep import estimate, gather, plan
 from twirl_mjx.sweep.grid import Grid, grids_folder, load
 from twirl_mjx.sweep.scheduler import Progress, RayExecutor, run_all

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from twirl_mjx.commands.options import parse_train, say
+from twirl_mjx.commands.console import say
+from twirl_mjx.commands.options import parse_train
 from twirl_mjx.training import pipeline
 
 

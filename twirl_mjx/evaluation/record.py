@@ -10,14 +10,14 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from twirl_mjx.config import TrainConfig
 from twirl_mjx.sim import look
 from twirl_mjx.sim.dynamics import get_shift, make_dynamics
 from twirl_mjx.sim.engine import world_model
 from twirl_mjx.sim.scene import Bands, build_scene
 from twirl_mjx.tasks.base import ground_at
-from twirl_mjx.tasks.registry import make_env
 from twirl_mjx.types import SourcePolicy
+from twirl_mjx.worlds.config import WorldConfig
+from twirl_mjx.worlds.make import make_env
 
 BANDS_AHEAD = 4.0
 """m, bands are drawn up to this far beyond the farthest point of the way."""
@@ -42,7 +42,7 @@ class Recording:
 
 
 def record_episode(
-    config: TrainConfig, policy: SourcePolicy, *, seed: int, steps: int | None = None
+    config: WorldConfig, policy: SourcePolicy, *, seed: int, steps: int | None = None
 ) -> Recording:
     """Roll one episode out.
 
@@ -56,8 +56,7 @@ def record_episode(
     reset_key, act_key = jax.random.split(jax.random.key(seed))
     state = jax.jit(env.reset)(reset_key)
     memory = policy.init(state)
-    task_state: Any = state.world.task
-    hurdles = np.asarray(getattr(task_state, "positions", np.zeros((1, 0))))[0]
+    hurdles = env.task.bands(jax.tree.map(lambda leaf: leaf[0], state.world.task))
     strength = np.asarray(state.world.motors.strength[0]).reshape(4, 3).min(axis=1)
 
     @jax.jit
@@ -72,7 +71,7 @@ def record_episode(
 
     rows: list[tuple[np.ndarray, ...]] = []
     metrics: list[dict[str, np.ndarray]] = []
-    keys = jax.random.split(act_key, steps or config.env.episode_length)
+    keys = jax.random.split(act_key, steps or config.episode_length)
     for key in keys:
         goal = np.asarray(place(state.world.goal[0]))
         before = np.asarray(state.data.qpos[0])
@@ -90,7 +89,7 @@ def record_episode(
     return Recording(qpos, goals, reward, stacked, tuple(map(float, reached)), strength)
 
 
-def scene_model(config: TrainConfig, recording: Recording) -> mujoco.MjModel:
+def scene_model(config: WorldConfig, recording: Recording) -> mujoco.MjModel:
     """Return the model to draw an episode in: its ground, bands and colours."""
     dynamics = make_dynamics(config.shift, config.shift_strength)
     bands = Bands(

@@ -10,9 +10,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from twirl_mjx.evaluation import measures
 from twirl_mjx.sim.dynamics import Dynamics
-from twirl_mjx.tasks.vector import EnvState, VectorEnv
+from twirl_mjx.tasks import measures
+from twirl_mjx.types import SourcePolicy
+from twirl_mjx.worlds.vector import EnvState, VectorEnv
 
 ActFn = Callable[[Any, Any, EnvState, jax.Array], tuple[jax.Array, Any]]
 """(parameters, memory, state, key) -> (actions [N, 12], memory)."""
@@ -43,7 +44,7 @@ def first_episodes(
         and one with a non-finite state, do not count. ``invalid`` is 1 where the episode was cut
         short by a non-finite state; measures are NaN where that was its first step.
     """
-    task = env.task.name
+    task = env.task
     reset_key, act_key = jax.random.split(key)
     state = env.reset(reset_key, dynamics, index)
 
@@ -88,3 +89,12 @@ def make_evaluate(
         return {k: np.asarray(v) for k, v in run(params, key, dynamics, index).items()}
 
     return evaluate
+
+
+def evaluate_policy(env: VectorEnv, policy: SourcePolicy) -> Callable[..., dict[str, np.ndarray]]:
+    """Return a compiled evaluation of any policy: ``evaluate(key, dynamics, index)``."""
+
+    def act(params: Any, memory: Any, state: EnvState, key: jax.Array) -> tuple[jax.Array, Any]:
+        return policy.act(memory, state, key)
+
+    return functools.partial(make_evaluate(env, policy.init, act), None)

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from twirl_mjx.config import TrainConfig
-from twirl_mjx.evaluation.rollout import make_evaluate
+from twirl_mjx.evaluation.rollout import evaluate_policy
 from twirl_mjx.sim.dynamics import SHIFTS, SceneKind, make_dynamics, stack
-from twirl_mjx.tasks.registry import make_env
 from twirl_mjx.types import SourcePolicy
+from twirl_mjx.worlds.config import WorldConfig
+from twirl_mjx.worlds.make import make_env
 
 
 def scenes_of(shifts: tuple[str, ...]) -> dict[SceneKind, list[str]]:
@@ -25,7 +24,7 @@ def scenes_of(shifts: tuple[str, ...]) -> dict[SceneKind, list[str]]:
 
 
 def evaluate_shifts(
-    config: TrainConfig,
+    config: WorldConfig,
     policy: SourcePolicy,
     *,
     episodes: int,
@@ -49,18 +48,14 @@ def evaluate_shifts(
     Returns:
         Per shift, every measure as an array [E].
     """
-
-    def act(params: Any, memory: Any, state: Any, key: jax.Array) -> tuple[jax.Array, Any]:
-        return policy.act(memory, state, key)
-
-    course = "fixed" if config.env.course == "auto" else config.env.course
-    config = dataclasses.replace(config, env=dataclasses.replace(config.env, course=course))
+    course = "fixed" if config.course == "auto" else config.course
+    config = dataclasses.replace(config, course=course)
     found: dict[str, dict[str, np.ndarray]] = {}
     for kind, names in scenes_of(shifts).items():
         env = make_env(config, num_envs=episodes * len(names), scene_kind=kind)
         dynamics = stack([make_dynamics(name, strength) for name in names], episodes)
         index = jnp.tile(jnp.arange(episodes), len(names))
-        values = make_evaluate(env, policy.init, act)(None, jax.random.key(seed), dynamics, index)
+        values = evaluate_policy(env, policy)(jax.random.key(seed), dynamics, index)
         for i, name in enumerate(names):
             part = slice(i * episodes, (i + 1) * episodes)
             found[name] = {k: v[part] for k, v in values.items()}

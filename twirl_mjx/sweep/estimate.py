@@ -10,9 +10,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from twirl_mjx.config import TrainConfig
-from twirl_mjx.sweep.plan import METRICS_CSV, Cell, reached_steps
-from twirl_mjx.training import rundir
+from twirl_mjx.sweep.plan import Cell, reached_steps
+from twirl_mjx.training.config import TrainConfig
+from twirl_mjx.training.rundir import RunDir
 
 START_S = 45.0
 """Start of a run: imports, cached programs, evaluations (measured on one busy core)."""
@@ -48,9 +48,9 @@ class Speed:
 def measure(runs: Path) -> list[Speed]:
     """Return the median speeds of all runs below a folder that have measured any."""
     speeds = []
-    for path in sorted(runs.glob(f"*/{METRICS_CSV}")):
+    for path in sorted(runs.glob("*/metrics.csv")):
         try:
-            config = rundir.read_config(path.parent)
+            config = RunDir(path.parent).read_config()
         except (FileNotFoundError, ValueError):
             continue  # not a run of this version: it tells nothing about these
         rates = _rates(path)
@@ -82,8 +82,8 @@ def _learner(config: TrainConfig) -> tuple[object, ...]:
 
 
 def _setting(config: TrainConfig) -> tuple[object, ...]:
-    droq, env = config.droq, config.env
-    return (config.task, env.num_envs, env.engine, droq.utd, droq.updates_per_block)
+    droq = config.droq
+    return (config.task, config.num_envs, config.engine, droq.utd, droq.updates_per_block)
 
 
 def estimate(cell: Cell, runs: Path, speeds: Sequence[Speed]) -> Estimate:

@@ -14,7 +14,8 @@ from pathlib import Path
 from twirl_mjx.figures.style import METRICS
 from twirl_mjx.figures.tables import CURVE_COLUMNS, EPISODE_COLUMNS
 from twirl_mjx.sweep.grid import Grid
-from twirl_mjx.sweep.plan import EVAL_CSV, METRICS_CSV, Cell, is_finished
+from twirl_mjx.sweep.plan import Cell, is_finished
+from twirl_mjx.training.rundir import RunDir
 
 MAX_POINTS = 100
 """Most rows of one metric of one run."""
@@ -91,7 +92,7 @@ def stale_tables(folder: Path, grid: Grid, arms: set[str]) -> list[Path]:
 
 def curve_rows(cell: Cell, runs: Path, columns: Sequence[str]) -> list[Row]:
     """Return the main metrics of a run; those of the evaluation at 0 where nothing was trained."""
-    path = runs / cell.name / METRICS_CSV
+    path = RunDir(runs / cell.name).metrics
     if cell.config.variant == "zero-shot" or not path.is_file():
         return _untrained_rows(cell, runs, columns)
     series: dict[str, list[Row]] = {}
@@ -118,7 +119,7 @@ def _untrained_rows(cell: Cell, runs: Path, columns: Sequence[str]) -> list[Row]
 
 def episode_rows(cell: Cell, runs: Path, columns: Sequence[str]) -> list[Row]:
     """Return the main metrics of every episode of a run's final evaluation."""
-    with (runs / cell.name / EVAL_CSV).open(newline="") as file:
+    with RunDir(runs / cell.name).episodes.open(newline="") as file:
         return [
             row | _settings(cell, columns)
             for row in csv.DictReader(file)

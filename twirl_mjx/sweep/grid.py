@@ -17,11 +17,11 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from twirl_mjx import config_json
 from twirl_mjx.checks import check_choice
-from twirl_mjx.config import TrainConfig
-from twirl_mjx.config_json import check_type
-from twirl_mjx.presets import PRESETS, make_config
+from twirl_mjx.records import check_type
+from twirl_mjx.training.config import TrainConfig
+from twirl_mjx.training.config_json import settle
+from twirl_mjx.training.presets import PRESETS, make_config
 
 BLOCK_KEYS = ("preset", "seeds", "axes", "base", "nominal")
 """What a block may hold; the first three are needed."""
@@ -164,23 +164,10 @@ def configure(preset: str, settings: Settings, where: str) -> TrainConfig:
         raise ValueError(f"{where} has no 'task'")
     check_type(f"{where}: task", settings["task"], str)
     try:
-        plain = dataclasses.asdict(make_config(settings["task"], preset))
-        for field, value in settings.items():
-            _assign(plain, field, value)
-        return config_json.from_dict(TrainConfig, plain)
+        plain = make_config(settings["task"], preset)
+        return settle(plain, {k: v for k, v in settings.items() if k != "task"})
     except ValueError as error:
         raise ValueError(f"{where}: {error}") from None
-
-
-def _assign(plain: dict[str, Any], field: str, value: Any) -> None:
-    """Set a dotted field of a config given as nested dicts."""
-    *parents, leaf = field.split(".")
-    node = plain
-    for parent in parents:
-        check_choice("config field", parent, tuple(k for k, v in node.items() if type(v) is dict))
-        node = node[parent]
-    check_choice("config field", leaf, tuple(node))
-    node[leaf] = value
 
 
 def check_unique(drafts: Sequence[Draft], where: str) -> None:

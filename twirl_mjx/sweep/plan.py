@@ -15,14 +15,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Literal
 
-from twirl_mjx import config_json
-from twirl_mjx.config import TrainConfig
-from twirl_mjx.presets import make_config
 from twirl_mjx.sweep.grid import Draft, Grid, configure
-from twirl_mjx.training import rundir, source_rules
-
-EVAL_CSV = "eval.csv"
-METRICS_CSV = "metrics.csv"
+from twirl_mjx.training import config_json, rundir, source_rules
+from twirl_mjx.training.config import TrainConfig
+from twirl_mjx.training.presets import make_config
+from twirl_mjx.training.rundir import RunDir
 
 Status = Literal["finished", "in use", "cut off", "missing"]
 
@@ -83,8 +80,9 @@ def given_nominals(paths: Sequence[Path]) -> dict[str, Path]:
     """
     found: dict[str, Path] = {}
     for path in paths:
-        config = rundir.read_config(path)
-        if config.shift != "none" or not (path / EVAL_CSV).is_file():
+        run_dir = RunDir(path)
+        config = run_dir.read_config()
+        if config.shift != "none" or not run_dir.episodes.is_file():
             raise ValueError(f"{path} is not a finished run without a shift")
         if config.task in found:
             raise ValueError(
@@ -158,11 +156,11 @@ def _adoptable(draft: Draft, runs: Path) -> str | None:
     """Return the name under which ``twirl train`` has finished the same run, if it has."""
     plain = make_config(draft.config.task, draft.preset)
     same = dataclasses.replace(plain, seed=draft.config.seed, variant=draft.config.variant)
-    run_dir = runs / rundir.default_name(same, draft.preset)
-    if draft.config != same or not (run_dir / EVAL_CSV).is_file():
+    run_dir = RunDir(runs / rundir.default_name(same, draft.preset))
+    if draft.config != same or not run_dir.episodes.is_file():
         return None
-    found = rundir.read_config(run_dir)
-    free = tuple(set(rundir.may_change(same)) - {"total_env_steps", "source"})
+    found = run_dir.read_config()
+    free = tuple(set(rundir.may_change(same)) - {"total_env_steps:", "source:"})
     differs = [line for line in config_json.diff(found, same) if not line.startswith(free)]
     return None if differs else run_dir.name
 
@@ -171,7 +169,7 @@ def _identity_of_path(path: Path) -> str:
     """Return a text that changes with the content of a policy file or the config of a run."""
     if path.is_dir():
         steps = evaluated_steps(path)
-        return f"{path.name} {rundir.digest(rundir.read_config(path))} at {steps}"
+        return f"{path.name} {rundir.digest(RunDir(path).read_config())} at {steps}"
     if not path.is_file():
         raise FileNotFoundError(f"no source policy {path}")
     return f"{path.name} {hashlib.sha256(path.read_bytes()).hexdigest()[:12]}"
@@ -186,7 +184,7 @@ def run_name(config: TrainConfig) -> str:
 
 def evaluated_steps(run_dir: Path) -> int | None:
     """Return the transitions at which a run was closed by its final evaluation, None if not."""
-    path = run_dir / EVAL_CSV
+    path = RunDir(run_dir).episodes
     if not path.is_file():
         return None
     with path.open(newline="") as file:
@@ -196,7 +194,7 @@ def evaluated_steps(run_dir: Path) -> int | None:
 
 def reached_steps(run_dir: Path) -> int:
     """Return the transitions of the last row of ``metrics.csv``, 0 without one."""
-    path = run_dir / METRICS_CSV
+    path = RunDir(run_dir).metrics
     if not path.is_file():
         return 0
     with path.open("rb") as file:
@@ -221,7 +219,7 @@ def is_finished(cell: Cell, runs: Path) -> bool:
     if steps is None:
         return False
     if cell.name == run_name(cell.config):
-        found = dataclasses.replace(rundir.read_config(run_dir), source=cell.config.source)
+        found = dataclasses.replace(RunDir(run_dir).read_config(), source=cell.config.source)
         if found != cell.config:
             lines = "\n  ".join(config_json.diff(found, cell.config))
             raise ValueError(f"{run_dir} was changed by hand (there -> cell):\n  {lines}")
@@ -232,7 +230,7 @@ def status_of(cell: Cell, runs: Path) -> Status:
     """Return how far a cell is; a run is finished when its process has let go of it, too."""
     run_dir = runs / cell.name
     finished = is_finished(cell, runs)
-    if rundir.owner(run_dir) is not None:
+    if RunDir(run_dir).owner() is not None:
         return "in use"
     if finished:
         return "finished"

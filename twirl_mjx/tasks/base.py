@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+from typing import Any
 
 import flax.struct
 import jax
@@ -12,8 +12,7 @@ import numpy as np
 from twirl_mjx.sim import a1, frames, kinematics
 from twirl_mjx.sim.actuation import FilterState, MotorState
 from twirl_mjx.sim.dynamics import Dynamics
-from twirl_mjx.sim.scene import CollisionSet, Scene, terrain_height
-from twirl_mjx.tasks.observations import Observer
+from twirl_mjx.sim.scene import Scene, terrain_height
 from twirl_mjx.types import Metrics
 
 FEET = a1.contact_mask(a1.FOOT)
@@ -21,6 +20,8 @@ START_NOISE = 0.05
 """rad, joint angles at the start of an episode get + U(-0.05, 0.05)."""
 BUMPY_START_HALF_SIZE = 20.0
 """m, on bumpy ground episodes start at x, y = U(-20, 20)."""
+STANDING_COSINE = 0.7
+"""Vertical part of the base x-axis from which on the robot counts as upright."""
 LIFTED = 0.01
 """m, a foot counts as off the ground above this clearance."""
 
@@ -89,38 +90,6 @@ class Outcome(flax.struct.PyTreeNode):
     metrics: Metrics
 
 
-class Task(Protocol):
-    """A Markov decision process over the A1; methods are pure, for one world, and vmappable."""
-
-    @property
-    def name(self) -> str:
-        """Name of the task."""
-        ...
-
-    @property
-    def collision(self) -> CollisionSet:
-        """Robot geoms the contact solver sees."""
-        ...
-
-    @property
-    def observer(self) -> Observer:
-        """What the policy sees."""
-        ...
-
-    @property
-    def metric_names(self) -> tuple[str, ...]:
-        """Names of the metrics of every outcome."""
-        ...
-
-    def start(self, key: jax.Array, scene: Scene, dynamics: Dynamics) -> Start:
-        """Draw the first state of an episode."""
-        ...
-
-    def judge(self, world: World, view: View, scene: Scene) -> Outcome:
-        """Score a control step; ``world`` already holds the new memory and action."""
-        ...
-
-
 def ground_at(scene: Scene, dynamics: Dynamics, xy: jax.Array) -> jax.Array:
     """Return the ground height [...] in m at ``xy`` [..., 2] for the world's dynamics."""
     return terrain_height(scene, xy, dynamics.incline, dynamics.bump_height)
@@ -163,6 +132,17 @@ def foot_clearance(view: View) -> jax.Array:
 def front_feet_lifted(view: View) -> jax.Array:
     """Return whether both front feet are off the ground."""
     return jnp.all(foot_clearance(view)[jnp.asarray(a1.FRONT_LEGS)] > LIFTED)
+
+
+def standing_metrics(view: View, cosine: jax.Array) -> Metrics:
+    """Return whether the robot stands: upright, front feet lifted, and then with no calf down.
+
+    Args:
+        view: The control step.
+        cosine: Vertical part of the base x-axis.
+    """
+    standing = (cosine >= STANDING_COSINE) & front_feet_lifted(view)
+    return {"standing": standing, "on_feet": standing & ~touches(view, a1.CALF)}
 
 
 def place_on_ground(scene: Scene, dynamics: Dynamics, qpos: jax.Array) -> jax.Array:

@@ -10,19 +10,23 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from typing import Literal
+from collections.abc import Mapping
+from typing import Any, Literal
 
 import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from twirl_mjx.config import TrainConfig
+from twirl_mjx.checks import check_choice, check_range
 from twirl_mjx.sim import a1, frames, kinematics
 from twirl_mjx.sim.dynamics import Dynamics
-from twirl_mjx.sim.scene import BUMP_HALF_SIZE, CONTROL_DT, CollisionSet, Scene
+from twirl_mjx.sim.scene import BUMP_HALF_SIZE, CONTROL_DT, Scene
 from twirl_mjx.tasks import bands, base, rewards
+from twirl_mjx.tasks.biped import POLISH
 from twirl_mjx.tasks.observations import ProprioceptiveObserver
+from twirl_mjx.tasks.registry import register
+from twirl_mjx.tasks.task import Link, Measure, Task
 
 WEIGHTS = {"forward": 0.7, "orientation": 0.05, "joint_calm": 0.15, "hurdle": 0.1}
 """Weights of the reward terms (paper appendix, table of the jumping task)."""
@@ -105,45 +109,89 @@ def next_goal(state: HurdlesState) -> jax.Array:
 def bonus(
     kind: Literal["count", "event", "clean"], before: HurdlesState, after: HurdlesState
 ) -> jax.Array:
-    """Return the hurdle term of a control step, see ``HurdlesConfig.hurdle_bonus``."""
+    """Return the hurdle term of a control step, see ``HurdlesOptions.hurdle_bonus``."""
     if kind == "event":
         return (after.passed - before.passed) * 1.0
     return jnp.sum(after.cleared) * 1.0 if kind == "clean" else after.passed * 1.0
 
 
-class Hurdles:
+HURDLES_SUCCESS = 2
+"""Hurdles passed that make an episode a success (the paper's courses have two)."""
+
+
+@dataclasses.dataclass(frozen=True)
+class HurdlesOptions:
+    """Task ``hurdles``: jump over randomly spaced hurdles."""
+
+    min_gap: float = 1.6
+    """m, smallest distance between neighbouring hurdles, and to the first."""
+    max_gap: float = 2.6
+    """m, largest distance."""
+    fixed_gap: float = 2.1
+    """m, distance when the course is fixed (dynamics shifts)."""
+    gap: float | None = None
+    """m, distance of all hurdles, on a fixed and on a random course, instead of the above."""
+    hurdle_bonus: Literal["count", "event", "clean"] = "count"
+    """Pay the number of hurdles passed so far at every step, or 1 when one is passed, or the
+    number passed in a single flight so far at every step."""
+
+    def __post_init__(self) -> None:
+        """Check the options (the task has a stricter check of the gaps), or raise ValueError."""
+        check_choice("hurdles.hurdle_bonus", self.hurdle_bonus, ("count", "event", "clean"))
+        for name in ("min_gap", "max_gap", "fixed_gap"):
+            check_range(f"hurdles.{name}", getattr(self, name), 0.0, 1000.0)
+        if self.gap is not None:
+            check_range("hurdles.gap", self.gap, bands.MIN_GAP, 1000.0)
+
+
+@register
+class Hurdles(Task[HurdlesOptions]):
     """See the module docstring."""
 
     name = "hurdles"
-    collision: CollisionSet = "legs"
-    metric_names = (
-        *WEIGHTS, "hurdles_passed", "clean_clearances", "hit_hurdle", "fall", "distance_x",
-        "goal_distance",
-    )  # fmt: skip
+    Options = HurdlesOptions
+    source = "imitate"
+    measures = {
+        "hurdles_passed": Measure("hurdles_passed", "max", 1.0, "1", "hurdles passed"),
+        "clean_clearances": Measure(
+            "clean_clearances", "max", 1.0, "1", "hurdles passed in a single flight phase"
+        ),
+        "hit_hurdle": Measure("hit_hurdle", "max", 1.0, "share", "ended by touching a hurdle"),
+        "fall": Measure("fall", "max", 1.0, "share", "ended by the trunk touching the ground"),
+        "distance_x": Measure("distance_x", "max", 1.0, "m", "way made along x"),
+    }
+    chain = (
+        Link("imitate", {"task": "imitate"}),
+        Link("hurdles", {"task": "hurdles"}),
+        # Gaps up to a little more than the 3.6 m of the paper's tests: the task has no such.
+        Link("polish", {"task": "hurdles", "hurdles.max_gap": 3.7} | POLISH),
+    )
+    course_options = ("min_gap", "max_gap", "fixed_gap", "gap")
+    caption = ("hurdles_passed",)
+    observer = ProprioceptiveObserver(axes=False)
 
-    def __init__(self, config: TrainConfig) -> None:
+    def __init__(self, options: HurdlesOptions | None = None, **setting: Any) -> None:
         """Keep the options of the task.
 
         Raises:
             ValueError: Gaps are out of order, or so small that two hurdles are within reach.
         """
-        options = config.hurdles
-        self._options = options
-        self._gaps = (options.min_gap, options.max_gap)
-        if config.fixed_course:
-            self._gaps = (options.fixed_gap, options.fixed_gap)
-        low, high = self._gaps
+        super().__init__(options, **setting)
+        low, high = self.options.min_gap, self.options.max_gap
+        if self.fixed_course:
+            low = high = self.options.fixed_gap
+        if self.options.gap is not None:
+            low = high = self.options.gap
         if not bands.MIN_GAP <= low <= high:
             raise ValueError(
                 f"hurdles have gaps from {low} to {high} m: the smallest must be at least"
                 f" {bands.MIN_GAP} m and the largest no smaller"
                 f" (nearest: {max(low, bands.MIN_GAP)} to {max(low, high, bands.MIN_GAP)})"
             )
-        env = config.env
-        seconds = max(env.episode_length, env.train_episode_length or 0) * CONTROL_DT
+        self._gaps = (low, high)
+        seconds = self.episode_length * CONTROL_DT
         self.num_hurdles = math.ceil(seconds * MAX_SPEED / low) + 1
         """H, never all passed in an episode."""
-        self.observer = ProprioceptiveObserver(axes=False)
 
     def start(self, key: jax.Array, scene: Scene, dynamics: Dynamics) -> base.Start:
         """Start on four feet, the first hurdle as far ahead as the others are apart."""
@@ -177,7 +225,7 @@ class Hurdles:
             "forward": rewards.forward(view.qvel[0]),
             "orientation": rewards.orientation(frames.rotation_angle(view.qpos[3:7])),
             "joint_calm": rewards.joint_calm(view.qvel[6:]),
-            "hurdle": bonus(self._options.hurdle_bonus, world.task, state),
+            "hurdle": bonus(self.options.hurdle_bonus, world.task, state),
         }
         goal = next_goal(state)
         fall = base.touches(view, a1.TRUNK)
@@ -196,3 +244,11 @@ class Hurdles:
                 "goal_distance": jnp.linalg.norm(goal - view.qpos[:2]),
             },
         )
+
+    def success(self, measures: Mapping[str, jax.Array]) -> jax.Array:
+        """Pass two hurdles."""
+        return measures["hurdles_passed"] >= HURDLES_SUCCESS
+
+    def bands(self, state: HurdlesState) -> np.ndarray:
+        """Return where the hurdles are."""
+        return np.asarray(state.positions)

@@ -14,7 +14,9 @@ ground under the robot; the observation goes on showing heights over the world's
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import flax.struct
 import jax
@@ -23,7 +25,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from twirl_mjx.assets import asset_path
-from twirl_mjx.config import TrainConfig
+from twirl_mjx.checks import check_range
 from twirl_mjx.motion.clip import Clip, headings, sample
 from twirl_mjx.motion.formats import foot_paths, read_clip
 from twirl_mjx.sim import a1, frames, kinematics
@@ -31,6 +33,8 @@ from twirl_mjx.sim.dynamics import Dynamics
 from twirl_mjx.sim.scene import CONTROL_DT, CollisionSet, Scene
 from twirl_mjx.tasks import base, rewards
 from twirl_mjx.tasks.observations import HISTORY, Entry
+from twirl_mjx.tasks.registry import register
+from twirl_mjx.tasks.task import Measure, Task
 
 WEIGHTS = {
     "pose": 0.5,
@@ -235,25 +239,62 @@ class ImitateState(flax.struct.PyTreeNode):
     """int32, completed cycles with such a flight."""
 
 
-class Imitate:
+LEAPS_SUCCESS = 3
+"""Leaps in a row that make an episode a success."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ImitateOptions:
+    """Task ``imitate``: track a leap clip."""
+
+    clip: str = "leap"
+    """``leap`` (ours) or the path of a clip file."""
+    standing_fraction: float = 0.0
+    """Share of episodes started at rest on four feet, as the episodes of ``hurdles`` are."""
+    max_root_error: float = 1.0
+    """m, an episode ends beyond this distance from the reference root."""
+    max_root_angle: float = 1.5707963
+    """rad, an episode ends beyond this rotation from the reference root."""
+
+    def __post_init__(self) -> None:
+        """Check every number, or raise ValueError."""
+        check_range("imitate.standing_fraction", self.standing_fraction, 0.0, 1.0)
+        check_range("imitate.max_root_error", self.max_root_error, 1e-3, 1e3)
+        check_range("imitate.max_root_angle", self.max_root_angle, 1e-3, 3.1416)
+
+
+@register
+class Imitate(Task[ImitateOptions]):
     """See the module docstring."""
 
     name = "imitate"
+    Options = ImitateOptions
     collision: CollisionSet = "feet"
-    metric_names = (
-        *WEIGHTS, "tracking", "leaps", "flights", "airborne", "root_error", "root_angle",
-        "fall", "lost",
-    )  # fmt: skip
+    measures = {
+        "tracking": Measure("tracking", "mean", 1.0, "1", "mean reward over its maximum"),
+        "leaps": Measure("leaps", "max", 1.0, "1", "cycles of the clip survived"),
+        "flights": Measure("flights", "max", 1.0, "1", "cycles with a flight of 4 steps or more"),
+    }
+    presets = {
+        "paper": {"imitate.standing_fraction": 0.2},
+        # Random actions hardly ever track the clip: it starts from planned ones.
+        "cpu": {"variant": "twirl", "source": "clip", "total_env_steps": 1_600_000,
+                "droq.discount": 0.95},
+    }  # fmt: skip
+    course_options = ("standing_fraction",)
+    training_options = ("standing_fraction",)
+    caption = ("tracking",)
+    observer: ImitateObserver
 
-    def __init__(self, config: TrainConfig) -> None:
+    def __init__(self, options: ImitateOptions | None = None, **setting: Any) -> None:
         """Load the clip.
 
         Raises:
-            FileNotFoundError: ``config.imitate.clip`` does not exist.
+            FileNotFoundError: The clip of the options does not exist.
             ValueError: It is not a clip, or does not wrap.
         """
-        self._config = config
-        self.observer = ImitateObserver(load_clip(config.imitate.clip))
+        super().__init__(options, **setting)
+        self.observer = ImitateObserver(load_clip(self.options.clip))
 
     def start(self, key: jax.Array, scene: Scene, dynamics: Dynamics) -> base.Start:
         """Start on the reference, or at rest in a share ``standing_fraction`` of the episodes.
@@ -268,9 +309,9 @@ class Imitate:
         endpoints = kinematics.forward(qpos).endpoints
         lowest = jnp.min(base.clearances(scene, dynamics, endpoints))
         qpos = qpos.at[2].add(jnp.maximum(-lowest, 0.0))
-        if self._config.imitate.standing_fraction > 0.0:
+        if self.options.standing_fraction > 0.0:
             rest, still = base.start_on_feet(pose_key, scene, dynamics)
-            take = jax.random.uniform(standing_key) < self._config.imitate.standing_fraction
+            take = jax.random.uniform(standing_key) < self.options.standing_fraction
             qpos, qvel = jnp.where(take, rest, qpos), jnp.where(take, still, qvel)
             phase = jnp.where(take, jnp.float32(self.observer.standing_time), phase)
         return base.Start(
@@ -287,7 +328,7 @@ class Imitate:
 
     def judge(self, world: base.World, view: base.View, scene: Scene) -> base.Outcome:
         """Score one control step against the reference at its end."""
-        options, qpos, qvel = self._config.imitate, view.qpos, view.qvel
+        options, qpos, qvel = self.options, view.qpos, view.qvel
         ref_qpos, ref_qvel = self.observer.reference(world.memory)
         root_error = jnp.append(qpos[:2], view.height) - ref_qpos[:3]
         turn = frames.multiply(frames.conjugate(ref_qpos[3:7]), qpos[3:7])
@@ -325,6 +366,10 @@ class Imitate:
                 "lost": lost,
             },
         )
+
+    def success(self, measures: Mapping[str, jax.Array]) -> jax.Array:
+        """Complete three cycles with a flight."""
+        return measures["flights"] >= LEAPS_SUCCESS
 
 
 def count_flights(state: ImitateState, airborne: jax.Array, completed: jax.Array) -> ImitateState:

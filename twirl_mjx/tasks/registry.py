@@ -1,116 +1,57 @@
-"""Tasks by name, and worlds from a config."""
+"""All tasks by name: those of this package, of a user's file, of installed packages."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+import re
 from typing import Any
 
-from twirl_mjx.checks import check_choice
-from twirl_mjx.config import TASKS as TASK_NAMES
-from twirl_mjx.config import TrainConfig
-from twirl_mjx.sim.dynamics import SceneKind, get_shift, make_dynamics
-from twirl_mjx.sim.engine import make_engine
-from twirl_mjx.sim.scene import SimOptions, build_scene
-from twirl_mjx.tasks.base import Task
-from twirl_mjx.tasks.biped import Biped
-from twirl_mjx.tasks.hurdles import Hurdles
-from twirl_mjx.tasks.imitate import Imitate
-from twirl_mjx.tasks.stand import Stand
-from twirl_mjx.tasks.vector import VectorEnv
+from twirl_mjx.plugins import Registry
+from twirl_mjx.tasks.task import Measure, Task
 
-TASKS: dict[str, Callable[[TrainConfig], Task]] = {
-    "stand": Stand,
-    "biped": Biped,
-    "imitate": Imitate,
-    "hurdles": Hurdles,
-}
+HOME = "twirl_mjx.tasks."
 
 
-def make_task(config: TrainConfig) -> Task:
-    """Return the task a config names.
+def accept(item: Any) -> type[Task]:
+    """Return a task class after checking what it says of itself.
 
     Raises:
-        ValueError: Unknown name, with the nearest valid one.
+        ValueError: It is no task, or a part of it has another form; one line.
     """
-    check_choice("task", config.task, TASK_NAMES)
-    return TASKS[config.task](config)
+    if not (isinstance(item, type) and issubclass(item, Task)):
+        raise ValueError(f"{_called(item)} is no task: expected a class derived from Task")
+    name = getattr(item, "name", None)
+    if not isinstance(name, str) or not re.fullmatch(r"[a-z][a-z0-9_]*", name):
+        raise ValueError(f"{_called(item)} has the name {name!r}, expected lower case letters,"
+                         f" digits and _ (nearest: {_called(item).lower()!r})")  # fmt: skip
+    options = item.Options
+    if not (isinstance(options, type) and dataclasses.is_dataclass(options)):
+        raise ValueError(f"{_called(item)}.Options is {options!r}, expected a frozen dataclass")
+    if not options.__dataclass_params__.frozen:  # type: ignore[attr-defined]
+        raise ValueError(f"{_called(item)}.Options is not frozen (@dataclass(frozen=True))")
+    for field in dataclasses.fields(options):
+        if field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING:
+            raise ValueError(f"{_called(item)}.Options.{field.name} has no default")
+    known = {field.name for field in dataclasses.fields(options)}
+    for part in ("course_options", "training_options"):
+        if unknown := [key for key in getattr(item, part) if key not in known]:
+            raise ValueError(f"{_called(item)}.{part} names {unknown[0]!r}, which is no option")
+    for key, measure in item.measures.items():
+        if not isinstance(measure, Measure):
+            raise ValueError(f"{_called(item)}.measures[{key!r}] is no Measure: {measure!r}")
+    return item
 
 
-def make_env(
-    config: TrainConfig,
-    *,
-    training: bool = False,
-    num_envs: int | None = None,
-    scene_kind: SceneKind | None = None,
-    threads: int | None = None,
-) -> VectorEnv:
-    """Return the worlds a config describes.
-
-    Args:
-        config: Task, shift and options.
-        training: Start and cut episodes as configured for training (``stand.risen_fraction``,
-            ``imitate.standing_fraction``, ``env.train_episode_length``), else as the task says.
-        num_envs: Worlds, ``config.env.num_envs`` by default.
-        scene_kind: Ground, that of the config's shift by default.
-        threads: Host threads of the native engine, all by default.
-    """
-    if not training:
-        config = dataclasses.replace(
-            config,
-            stand=dataclasses.replace(config.stand, risen_fraction=0.0),
-            imitate=dataclasses.replace(config.imitate, standing_fraction=0.0),
-            env=dataclasses.replace(config.env, train_episode_length=None),
-        )
-    task = make_task(config)
-    scene = build_scene(
-        scene_kind or get_shift(config.shift).scene, collision=task.collision, options=SimOptions()
-    )
-    return VectorEnv(
-        task,
-        scene,
-        make_engine(config.env.engine, scene, threads),
-        num_envs=num_envs or config.env.num_envs,
-        episode_length=config.env.train_episode_length or config.env.episode_length,
-        dynamics=make_dynamics(config.shift, config.shift_strength),
-    )
+def _called(item: Any) -> str:
+    return getattr(item, "__name__", None) or f"{item!r}"
 
 
-def make(
-    task: str,
-    shift: str | None = None,
-    num_envs: int | None = None,
-    *,
-    shift_strength: float | None = None,
-    engine: str | None = None,
-    config: TrainConfig | None = None,
-) -> VectorEnv:
-    """Return vectorised worlds of a task.
+TASKS: Registry[type[Task]] = Registry(
+    "task",
+    home=tuple(HOME + name for name in ("stand", "biped", "imitate", "hurdles")),
+    accept=accept,
+    group="twirl_mjx.tasks",
+)
+"""The one list of tasks."""
 
-    Args:
-        task: stand, biped, imitate or hurdles.
-        shift: none, bumpy, icy, weakened, sloped or gravity.
-        num_envs: Worlds stepped together.
-        shift_strength: 0 is nominal, 1 the paper's value.
-        engine: auto, mjx or native.
-        config: Everything that is not given here; without it the paper's defaults, no shift and
-            256 worlds.
-
-    Raises:
-        ValueError: An unknown name or a value out of range, with the nearest valid choice.
-    """
-    check_choice("task", task, TASK_NAMES)
-    if num_envs is None:
-        num_envs = config.env.num_envs if config else 256
-    base = config or TrainConfig()
-    env = dataclasses.replace(base.env, num_envs=num_envs, **_given(engine=engine))
-    droq = dataclasses.replace(base.droq, utd=base.droq.updates_per_block / num_envs)
-    conditions = _given(shift=shift, shift_strength=shift_strength)
-    return make_env(
-        dataclasses.replace(base, task=task, env=env, droq=droq, **conditions), training=True
-    )
-
-
-def _given(**options: Any) -> dict[str, Any]:
-    """Return the options that are not None."""
-    return {name: value for name, value in options.items() if value is not None}
+register = TASKS.register

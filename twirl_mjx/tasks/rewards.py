@@ -16,11 +16,6 @@ def height_bonus(height: jax.Array) -> jax.Array:
     return jnp.exp(height) - 1.0
 
 
-def stand(cosine: jax.Array, height: jax.Array) -> jax.Array:
-    """Return r_stand = r_upright + r_height."""
-    return normalised_cosine(cosine) + height_bonus(height)
-
-
 def facing_cosine(base_z_axis_w: jax.Array, displacement: jax.Array) -> jax.Array:
     """Return the cosine between the base's down vector and the way to the goal.
 

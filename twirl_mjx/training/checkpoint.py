@@ -18,7 +18,6 @@ import jax.numpy as jnp
 import numpy as np
 import orbax.checkpoint as ocp
 
-from twirl_mjx.training import rundir
 from twirl_mjx.training.state import TrainState
 
 KEEP = 2
@@ -276,10 +275,14 @@ def load_learner(run_dir: Path) -> dict[str, Any]:
     return {k: nested[k] for k in ("actor", "critic", "target_critic", "log_temperature")}
 
 
-def load_replay(run_dir: Path) -> np.ndarray:
+def load_replay(run_dir: Path, capacity: int) -> np.ndarray:
     """Return the packed rows [n, W] of the online ring at a run's newest checkpoint, in order.
 
     The log also keeps rows that the ring has overwritten since; they are left out.
+
+    Args:
+        run_dir: Directory of the run.
+        capacity: Rows that its ring holds.
 
     Raises:
         FileNotFoundError: The run has no checkpoint or no stored experience.
@@ -292,5 +295,5 @@ def load_replay(run_dir: Path) -> np.ndarray:
     folder = run_dir / "checkpoints" / "replay"
     if not _segments(folder):
         raise FileNotFoundError(f"{run_dir} has no stored experience")
-    begin = max(0, total - rundir.read_config(run_dir).replay.capacity)
+    begin = max(0, total - capacity)
     return np.concatenate([part for _, part in _stored_rows(folder, begin, total)])

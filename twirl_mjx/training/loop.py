@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import dataclasses
 import math
 import threading
@@ -15,27 +14,23 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from twirl_mjx.config import TrainConfig
 from twirl_mjx.droq import learner as droq
 from twirl_mjx.droq.state import DroqState
-from twirl_mjx.evaluation.measures import episode_means
 from twirl_mjx.evaluation.rollout import make_evaluate
 from twirl_mjx.policies.learned import NumpyPolicy, PolicyHeader, load_policy, save_policy
 from twirl_mjx.replay.ring import RingBuffer
+from twirl_mjx.tasks.measures import episode_means
 from twirl_mjx.tasks.observations import layout_slices
-from twirl_mjx.tasks.registry import make_env
-from twirl_mjx.tasks.vector import VectorEnv
 from twirl_mjx.training import rundir, state
-from twirl_mjx.training.checkpoint import Checkpoints, has_checkpoint
+from twirl_mjx.training.checkpoint import Checkpoints
+from twirl_mjx.training.config import TrainConfig
 from twirl_mjx.training.guards import check_experience, check_finite
 from twirl_mjx.training.metrics import RunLogger
+from twirl_mjx.training.rundir import RunDir
 from twirl_mjx.training.signals import stop_on_signal
 from twirl_mjx.training.state import TrainState
-
-EVAL_CSV = "eval.csv"
-EVAL_COLUMNS = (
-    "run", "task", "shift", "variant", "seed", "env_steps", "episode", "metric", "value",
-)  # fmt: skip
+from twirl_mjx.worlds.make import make_env
+from twirl_mjx.worlds.vector import VectorEnv
 
 
 @dataclasses.dataclass(frozen=True)
@@ -81,25 +76,20 @@ class Run:
     """One training run: owns the directory, the compiled functions and the loop's bookkeeping."""
 
     def __init__(
-        self, config: TrainConfig, run_dir: Path, source: RingBuffer | None, stage: str
+        self, config: TrainConfig, run_dir: RunDir, source: RingBuffer | None, stage: str
     ) -> None:
-        """Open the run directory and build (not compile) everything.
-
-        Raises:
-            RunMismatchError: The directory holds another run.
-        """
-        rundir.open_run(run_dir, config)
+        """Build (not compile) everything."""
         self.config = config
         self.run_dir = run_dir
-        self.env = make_env(config, training=True)
-        self.checkpoints = Checkpoints(run_dir)
+        self.env = make_env(config)
+        self.checkpoints = Checkpoints(run_dir.path)
         self.stage = stage
         self.source = source
         self.source_rows = 0.0 if source is None else float(source.size)
         self.resumed_at: int | None = None
         self.took_weights = False
         self.progress: dict[str, Any] = {"best": -math.inf, "wall_s": 0.0, "inserted": 0}
-        env = make_env(config, num_envs=config.eval.episodes)
+        env = make_env(config.evaluation)
         self._evaluate = make_evaluate(env, no_memory, act_mean)
         self._epoch = state.compile_epoch(config, self.env)
 
@@ -129,13 +119,13 @@ class Run:
         """Evaluate the deterministic policy on the evaluation seed; keep the best policy."""
         values = self._evaluate(train_state.learner.actor, jax.random.key(self.config.eval.seed))
         means = episode_means(values)
-        self.save_policy("policy_last.npz", train_state, means)
+        self.save_policy(self.run_dir.last_policy, train_state, means)
         if means["return"] > self.progress["best"]:
             self.progress["best"] = means["return"]
-            self.save_policy("policy.npz", train_state, means)
+            self.save_policy(self.run_dir.policy, train_state, means)
         return {f"eval/{name}": v for name, v in means.items()}
 
-    def save_policy(self, name: str, train_state: TrainState, means: dict[str, float]) -> None:
+    def save_policy(self, path: Path, train_state: TrainState, means: dict[str, float]) -> None:
         """Write the present actor as a policy file of the run."""
         card = {
             "seed": self.config.seed,
@@ -145,11 +135,11 @@ class Run:
             "grad_steps": int(train_state.learner.grad_steps),
             "replay_ratio": self.config.droq.replay_ratio,
             "wall_s": round(self.progress["wall_s"], 1),
-            "options": dataclasses.asdict(getattr(self.config, self.config.task)),
+            "options": dataclasses.asdict(self.config.options),
             "evaluation": means,
         }
         actor = jax.tree.map(np.asarray, train_state.learner.actor)
-        save_policy(self.run_dir / name, actor, make_header(self.config, self.env, card))
+        save_policy(path, actor, make_header(self.config, self.env, card))
 
     def save(self, train_state: TrainState) -> None:
         """Write a checkpoint; refuses a state that is not finite."""
@@ -199,7 +189,7 @@ class Run:
 
 def train(
     config: TrainConfig,
-    run_dir: Path,
+    run_dir: RunDir,
     *,
     source: RingBuffer | None = None,
     initial: Callable[[DroqState], DroqState] | None = None,
@@ -209,22 +199,18 @@ def train(
 
     Args:
         config: The run; its ``total_env_steps`` is rounded up to whole epochs.
-        run_dir: Its directory.
+        run_dir: Its directory, judged to be new or resumable (``RunDir.status``).
         source: Frozen source experience; needed when ``config.uses_source_data``.
         initial: Changes the fresh learner before the first transition.
         stage: Name shown with the progress.
 
     Raises:
-        RunMismatchError: The directory holds another run, or a finished one that cannot go on.
         DivergedError: The learner is no longer finite.
         ValueError: Source data are needed and missing.
     """
     if config.uses_source_data and source is None:
         raise ValueError(f"variant {config.variant} with phi {config.replay.phi} needs source data")
-    rundir.check_run(run_dir, config)
-    if (done := finished(run_dir, config.total_env_steps)) is not None:
-        return done
-    check_resumable(run_dir)
+    run_dir.open(config)
     run = Run(config, run_dir, source, stage)
     try:
         train_state = run.start(initial)
@@ -232,8 +218,8 @@ def train(
         with (
             stop_on_signal() as stop,
             RunLogger(
-                run_dir,
-                rundir.identity(run_dir, config),
+                run_dir.path,
+                run_dir.identity(config),
                 config.total_env_steps,
                 stage,
                 run.resumed_at,
@@ -258,59 +244,13 @@ def train(
         run.close()
 
 
-def final_evaluation(config: TrainConfig, run_dir: Path, env_steps: int) -> dict[str, float]:
+def final_evaluation(config: TrainConfig, run_dir: RunDir, env_steps: int) -> dict[str, float]:
     """Evaluate the best policy of a run on fresh seeds and write ``eval.csv``."""
-    policy = load_policy(run_dir / "policy.npz")
+    policy = load_policy(run_dir.policy)
     assert isinstance(policy, NumpyPolicy), "a run writes .npz policies"
     actor = jax.tree.map(jnp.asarray, dict(policy.actor_params))
-    env = make_env(config, num_envs=config.eval.final_episodes)
+    env = make_env(config.evaluation, num_envs=config.eval.final_episodes)
     evaluate = make_evaluate(env, no_memory, act_mean)
     values = evaluate(actor, jax.random.key(config.eval.seed + 1))
-    write_episodes(run_dir / EVAL_CSV, rundir.identity(run_dir, config), env_steps, values)
+    run_dir.write_episodes(config, env_steps, values)
     return episode_means(values)
-
-
-def check_resumable(run_dir: Path) -> None:
-    """Refuse a run that was finished and cannot go on: starting anew would replace its policy.
-
-    Raises:
-        RunMismatchError: It has an ``eval.csv`` but no checkpoint.
-    """
-    done = finished(run_dir, 0)
-    if done is not None and not has_checkpoint(run_dir):
-        raise rundir.RunMismatchError(
-            f"{run_dir} was finished at {done.env_steps:,} transitions and its checkpoints are"
-            " gone, so it cannot go on; nothing was touched. Give another --name; its policy can"
-            f" start that run: --variant weights --source {run_dir}/policy.npz"
-        )
-
-
-def finished(run_dir: Path, total_env_steps: int) -> Outcome | None:
-    """Return how a run ended if its ``eval.csv`` closes at least ``total_env_steps``, else None."""
-    path = run_dir / EVAL_CSV
-    if not path.is_file():
-        return None
-    values: dict[str, list[float]] = {}
-    env_steps = 0
-    with path.open(newline="") as file:
-        for row in csv.DictReader(file):
-            env_steps = int(row["env_steps"])
-            values.setdefault(row["metric"], []).append(float(row["value"]))
-    if env_steps < total_env_steps:
-        return None
-    return Outcome(True, env_steps, episode_means({k: np.array(v) for k, v in values.items()}))
-
-
-def write_episodes(
-    path: Path, identity: dict[str, str], env_steps: int, values: dict[str, np.ndarray]
-) -> None:
-    """Write episode measures [E] as a tidy table, whole or not at all; NaN has no row."""
-    partial = path.with_name(path.name + ".partial")
-    with partial.open("w", newline="") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(EVAL_COLUMNS)
-        for name, column in values.items():
-            for episode in np.flatnonzero(~np.isnan(column)):
-                row = [env_steps, episode, name, f"{float(column[episode]):.9g}"]
-                writer.writerow([*identity.values(), *row])
-    partial.replace(path)

@@ -1,8 +1,9 @@
-"""A run directory: its resolved config, what may change on resume, versions of everything."""
+"""A run directory: where everything of a run lies, whose it is, and what state it is in."""
 
 from __future__ import annotations
 
 import contextlib
+import csv
 import dataclasses
 import fcntl
 import functools
@@ -16,23 +17,25 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-from twirl_mjx import config_json, exits
-from twirl_mjx.config import TASKS, TrainConfig
+import numpy as np
 
-CONFIG_NAME = "config.json"
-SOURCE_NAME = "source.json"
-VERSIONS_NAME = "versions.json"
-LOCK_NAME = ".lock"
+from twirl_mjx import exits
+from twirl_mjx.policies.learned import BEST_POLICY, LAST_POLICY
+from twirl_mjx.tasks.measures import episode_means
+from twirl_mjx.training import config_json
+from twirl_mjx.training.checkpoint import has_checkpoint
+from twirl_mjx.training.config import TrainConfig
+
 PACKAGES = (
     "twirl-mjx", "mujoco", "mujoco-mjx", "jax", "jaxlib", "brax", "flax", "optax",
     "orbax-checkpoint", "numpy",
 )  # fmt: skip
-MAY_CHANGE = ("total_env_steps", "checkpoint_minutes", "eval.", "env.engine", "source")
-"""Fields a resumed run may have changed: they do not alter what was done so far."""
-WORK = ("source.npz", "checkpoints", "metrics.csv", "policy.npz", "eval.csv")
-"""What a stage leaves behind; without any of it a directory may be given to another config."""
-READS_OPTIONS_OF = {"stand": ("stand", "biped")}
-"""Tasks whose options a task reads, where these are not its own alone (stand shows a goal)."""
+MAY_CHANGE = ("total_env_steps:", "checkpoint_minutes:", "eval.", "engine:", "source:", "uses:")
+"""How the lines of a difference begin that a resumed run may have: they do not alter what was done
+so far. (``source`` is judged by its digest.)"""
+EVAL_COLUMNS = (
+    "run", "task", "shift", "variant", "seed", "env_steps", "episode", "metric", "value",
+)  # fmt: skip
 
 
 class RunMismatchError(ValueError):
@@ -45,41 +48,247 @@ class RunBusyError(RuntimeError):
     exit_status = exits.BUSY
 
 
-@contextlib.contextmanager
-def exclusive(run_dir: Path, wait_s: float = 1.0) -> Iterator[None]:
-    """Hold a run directory: nobody else trains in it meanwhile; ends with the process at last.
-
-    Raises:
-        RunBusyError: Another process holds it; the message names that process.
-    """
-    run_dir.mkdir(parents=True, exist_ok=True)
-    with (run_dir / LOCK_NAME).open("a+") as file:
-        deadline = time.monotonic() + wait_s
-        while not _try_lock(file.fileno(), fcntl.LOCK_EX):
-            if time.monotonic() > deadline:
-                raise busy(run_dir)
-            time.sleep(0.1)
-        file.truncate(0)
-        file.write(f"process {os.getpid()} on {platform.node()}")
-        file.flush()
-        yield
+@dataclasses.dataclass(frozen=True)
+class New:
+    """Nothing of a run is there yet."""
 
 
-def busy(run_dir: Path) -> RunBusyError:
-    """Return the refusal to work in a directory that another process holds."""
-    return RunBusyError(
-        f"{run_dir} is in use by {owner(run_dir) or 'another process'}: wait for it,"
-        " stop it, or give another --name"
-    )
+@dataclasses.dataclass(frozen=True)
+class Resumable:
+    """A part of this very run is there."""
 
 
-def owner(run_dir: Path) -> str | None:
-    """Return who holds a run directory, None when nobody does."""
-    path = run_dir / LOCK_NAME
-    if not path.is_file():
-        return None
-    with path.open() as file:
-        return None if _try_lock(file.fileno(), fcntl.LOCK_SH) else file.read() or "a process"
+@dataclasses.dataclass(frozen=True)
+class Finished:
+    """This very run, trained and evaluated to its budget."""
+
+    env_steps: int
+    """Transitions of the policy that was evaluated."""
+    measures: dict[str, float]
+    """Means over the closing episodes."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Foreign:
+    """Something that this run must not touch."""
+
+    error: RunMismatchError
+
+
+@dataclasses.dataclass(frozen=True)
+class Busy:
+    """Another process works there."""
+
+    error: RunBusyError
+
+
+Status = New | Resumable | Finished | Foreign | Busy
+
+
+class RunDir:
+    """The directory of one run: where everything of it lies, and what state it is in."""
+
+    def __init__(self, path: Path | str) -> None:
+        """Name a directory; it need not exist."""
+        self.path = Path(path)
+        self._is_held = False
+
+    def __str__(self) -> str:
+        return str(self.path)
+
+    @property
+    def name(self) -> str:
+        """Name of the run."""
+        return self.path.name
+
+    @property
+    def config(self) -> Path:
+        """The resolved config, JSON."""
+        return self.path / "config.json"
+
+    @property
+    def source(self) -> Path:
+        """Origin and digest of the source, JSON."""
+        return self.path / "source.json"
+
+    @property
+    def dataset(self) -> Path:
+        """The collected source experience."""
+        return self.path / "source.npz"
+
+    @property
+    def versions(self) -> Path:
+        """Versions of packages, machine and code, JSON."""
+        return self.path / "versions.json"
+
+    @property
+    def lock(self) -> Path:
+        """Held by the process that works here."""
+        return self.path / ".lock"
+
+    @property
+    def metrics(self) -> Path:
+        """Every metric of every epoch, a tidy table."""
+        return self.path / "metrics.csv"
+
+    @property
+    def checkpoints(self) -> Path:
+        """Training states, and the replay as an append-only log."""
+        return self.path / "checkpoints"
+
+    @property
+    def policy(self) -> Path:
+        """The best policy by evaluation return."""
+        return self.path / BEST_POLICY
+
+    @property
+    def last_policy(self) -> Path:
+        """The newest policy that was evaluated."""
+        return self.path / LAST_POLICY
+
+    @property
+    def episodes(self) -> Path:
+        """The closing episodes, a tidy table; its existence closes the run."""
+        return self.path / "eval.csv"
+
+    def status(self, config: TrainConfig, source: dict[str, str] | None = None) -> Status:
+        """Judge the directory for a run, once and whole; touches nothing.
+
+        Args:
+            config: The run.
+            source: ``origin`` and ``digest`` of its source, where they are known.
+        """
+        if not self._is_held and self.owner():
+            return Busy(self.busy())
+        work = (self.dataset, self.checkpoints, self.metrics, self.policy, self.episodes)
+        if not self.config.exists() or not any(path.exists() for path in work):
+            return New()
+        if lines := self._differences(config, source):
+            shown = "\n  ".join(lines)
+            return Foreign(RunMismatchError(
+                f"{self} holds another run; nothing was touched. Differences (there -> here):"
+                f"\n  {shown}\nGive the same settings to resume it, or another --name."
+            ))  # fmt: skip
+        done = self.finished()
+        budget = 0 if config.variant == "zero-shot" else config.total_env_steps
+        if done is not None and done.env_steps >= budget:
+            return done
+        if done is not None and not has_checkpoint(self.path):
+            return Foreign(RunMismatchError(
+                f"{self} was finished at {done.env_steps:,} transitions and its checkpoints are"
+                " gone, so it cannot go on; nothing was touched. Give another --name; its policy"
+                f" can start that run: --variant weights --source {self.policy}"
+            ))  # fmt: skip
+        return Resumable()
+
+    def _differences(self, config: TrainConfig, source: dict[str, str] | None) -> list[str]:
+        """Return what differs between the run that is there and one that is meant."""
+        text = self.config.read_text()
+        old = config_json.from_json(text)
+        free = may_change(config)
+        lines = [li for li in config_json.diff(old, config) if not li.startswith(free)]
+        known = self.read_source()
+        # Version 0.1 computed digests over other names: there the origin has to do.
+        part = "origin" if config_json.is_version_0_1(text) else "digest"
+        if source and known and known[part] != source[part]:
+            lines += [f"source {key}: {known[key]!r} -> {source[key]!r}" for key in source]
+        return lines
+
+    def finished(self) -> Finished | None:
+        """Return how the run was closed, None if it was not."""
+        if not self.episodes.is_file():
+            return None
+        values: dict[str, list[float]] = {}
+        env_steps = 0
+        with self.episodes.open(newline="") as file:
+            for row in csv.DictReader(file):
+                env_steps = int(row["env_steps"])
+                values.setdefault(row["metric"], []).append(float(row["value"]))
+        return Finished(env_steps, episode_means({k: np.array(v) for k, v in values.items()}))
+
+    def open(self, config: TrainConfig, source: dict[str, str] | None = None) -> None:
+        """Write down config, source and versions of the part of the run that follows."""
+        self.path.mkdir(parents=True, exist_ok=True)
+        _write(self.config, config_json.to_json(config))
+        if source:
+            _write(self.source, json.dumps(source, indent=2, sort_keys=True) + "\n")
+        _write(self.versions, json.dumps(versions(), indent=2, sort_keys=True) + "\n")
+
+    def read_config(self) -> TrainConfig:
+        """Return the config of the run.
+
+        Raises:
+            FileNotFoundError: This is no run directory; the message lists the runs beside it.
+        """
+        if not self.config.is_file():
+            parent = self.path.parent
+            runs = sorted(p.parent.name for p in parent.glob(f"*/{self.config.name}"))
+            raise FileNotFoundError(
+                f"{self} is not a run: it has no {self.config.name}; runs in {parent}:"
+                f" {', '.join(runs) or 'none'}"
+            )
+        return config_json.from_json(self.config.read_text())
+
+    def read_source(self) -> dict[str, str] | None:
+        """Return ``origin`` and ``digest`` of the source, None when it has (or recorded) none."""
+        return json.loads(self.source.read_text()) if self.source.is_file() else None
+
+    def identity(self, config: TrainConfig) -> dict[str, str]:
+        """Return the identity columns of the run's tables."""
+        columns = ("task", "shift", "variant", "seed")
+        return {"run": self.name} | {name: str(getattr(config, name)) for name in columns}
+
+    def write_episodes(
+        self, config: TrainConfig, env_steps: int, values: dict[str, np.ndarray]
+    ) -> None:
+        """Write the closing episodes, measures [E], whole or not at all; NaN has no row."""
+        partial = self.episodes.with_name(self.episodes.name + ".partial")
+        identity = self.identity(config).values()
+        with partial.open("w", newline="") as file:
+            writer = csv.writer(file, lineterminator="\n")
+            writer.writerow(EVAL_COLUMNS)
+            for name, column in values.items():
+                for episode in np.flatnonzero(~np.isnan(column)):
+                    row = [env_steps, episode, name, f"{float(column[episode]):.9g}"]
+                    writer.writerow([*identity, *row])
+        partial.replace(self.episodes)
+
+    @contextlib.contextmanager
+    def exclusive(self, wait_s: float = 1.0) -> Iterator[None]:
+        """Hold the directory: nobody else works in it meanwhile; ends with the process at last.
+
+        Raises:
+            RunBusyError: Another process holds it; the message names that process.
+        """
+        self.path.mkdir(parents=True, exist_ok=True)
+        with self.lock.open("a+") as file:
+            deadline = time.monotonic() + wait_s
+            while not _try_lock(file.fileno(), fcntl.LOCK_EX):
+                if time.monotonic() > deadline:
+                    raise self.busy()
+                time.sleep(0.1)
+            file.truncate(0)
+            file.write(f"process {os.getpid()} on {platform.node()}")
+            file.flush()
+            self._is_held = True
+            try:
+                yield
+            finally:
+                self._is_held = False
+
+    def busy(self) -> RunBusyError:
+        """Return the refusal to work in a directory that another process holds."""
+        return RunBusyError(
+            f"{self} is in use by {self.owner() or 'another process'}: wait for it,"
+            " stop it, or give another --name"
+        )
+
+    def owner(self) -> str | None:
+        """Return who holds the directory, None when nobody does."""
+        if not self.lock.is_file():
+            return None
+        with self.lock.open() as file:
+            return None if _try_lock(file.fileno(), fcntl.LOCK_SH) else file.read() or "a process"
 
 
 def _try_lock(descriptor: int, kind: int) -> bool:
@@ -119,74 +328,9 @@ def digest(config: TrainConfig) -> str:
 
 
 def may_change(config: TrainConfig) -> tuple[str, ...]:
-    """Return how the names of the fields begin that a resumed run may have changed."""
-    read = READS_OPTIONS_OF.get(config.task, (config.task,))
-    return (*MAY_CHANGE, *(f"{task}." for task in TASKS if task not in read))
-
-
-def check_run(run_dir: Path, config: TrainConfig, source: dict[str, str] | None = None) -> None:
-    """Check that a run directory belongs to this config, or holds no work yet; touches nothing.
-
-    Args:
-        run_dir: The directory.
-        config: The run.
-        source: ``origin`` and ``digest`` of the source, where the run has one.
-
-    Raises:
-        RunMismatchError: Another task, config or source lives there; the message has the
-            differences.
-    """
-    path = run_dir / CONFIG_NAME
-    if path.exists() and any((run_dir / name).exists() for name in WORK):
-        old = config_json.from_json(path.read_text())
-        changed, free = config_json.diff(old, config), may_change(config)
-        lines = [line for line in changed if not line.startswith(free)]
-        known = read_source(run_dir)
-        if source and known and known["digest"] != source["digest"]:
-            lines += [f"source {key}: {known[key]!r} -> {source[key]!r}" for key in source]
-        if lines:
-            shown = "\n  ".join(lines)
-            raise RunMismatchError(
-                f"{run_dir} holds another run; nothing was touched. Differences (there -> here):"
-                f"\n  {shown}\nGive the same settings to resume it, or another --name."
-            )
-
-
-def open_run(run_dir: Path, config: TrainConfig, source: dict[str, str] | None = None) -> None:
-    """Create a run directory, or go on with one that belongs to this config.
-
-    Args and errors are those of :func:`check_run`. What is written is of today: config, source and
-    versions of the part of the run that follows.
-    """
-    check_run(run_dir, config, source)
-    run_dir.mkdir(parents=True, exist_ok=True)
-    _write(run_dir / CONFIG_NAME, config_json.to_json(config))
-    if source:
-        _write(run_dir / SOURCE_NAME, json.dumps(source, indent=2, sort_keys=True) + "\n")
-    _write(run_dir / VERSIONS_NAME, json.dumps(versions(), indent=2, sort_keys=True) + "\n")
-
-
-def read_source(run_dir: Path) -> dict[str, str] | None:
-    """Return ``origin`` and ``digest`` of a run's source, None when it has (or recorded) none."""
-    path = run_dir / SOURCE_NAME
-    return json.loads(path.read_text()) if path.is_file() else None
-
-
-def read_config(run_dir: Path) -> TrainConfig:
-    """Return the config of a run.
-
-    Raises:
-        FileNotFoundError: ``run_dir`` is no run directory; the message lists the runs beside it.
-    """
-    path = run_dir / CONFIG_NAME
-    if not path.is_file():
-        parent = run_dir.parent
-        runs = sorted(p.parent.name for p in parent.glob(f"*/{CONFIG_NAME}"))
-        raise FileNotFoundError(
-            f"{run_dir} is not a run: it has no {CONFIG_NAME}; runs in {parent}:"
-            f" {', '.join(runs) or 'none'}"
-        )
-    return config_json.from_json(path.read_text())
+    """Return how the lines begin (``config_json.diff``) in which a resumed run may differ."""
+    source = config.task_type.source
+    return (*MAY_CHANGE, *([f"{source}."] if source else []))
 
 
 @functools.cache
@@ -226,11 +370,3 @@ def _write(path: Path, text: str) -> None:
     partial = path.with_name(path.name + ".partial")
     partial.write_text(text)
     partial.replace(path)
-
-
-def identity(run_dir: Path, config: TrainConfig) -> dict[str, str]:
-    """Return the identity columns of the run's tables."""
-    fields = dataclasses.asdict(config)
-    return {"run": run_dir.name} | {
-        name: str(fields[name]) for name in ("task", "shift", "variant", "seed")
-    }

@@ -16,13 +16,13 @@ from typing import Any
 
 import jax
 
-from twirl_mjx.config import TrainConfig
 from twirl_mjx.replay.mixed import MixedReplay
 from twirl_mjx.replay.ring import RingBuffer
-from twirl_mjx.tasks.vector import VectorEnv
 from twirl_mjx.training import state as single
+from twirl_mjx.training.config import TrainConfig
 from twirl_mjx.training.state import TrainState
 from twirl_mjx.types import Metrics
+from twirl_mjx.worlds.vector import VectorEnv
 
 
 def per_field(batched: Any, shared: Any) -> Any:

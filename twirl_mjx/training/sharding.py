@@ -15,11 +15,11 @@ import jax
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from twirl_mjx.config import TrainConfig
-from twirl_mjx.tasks.vector import EnvState, VectorEnv
 from twirl_mjx.training import seeds
+from twirl_mjx.training.config import TrainConfig
 from twirl_mjx.training.state import TrainState, train_epoch
 from twirl_mjx.types import Metrics
+from twirl_mjx.worlds.vector import EnvState, VectorEnv
 
 Epoch = Callable[[TrainState], tuple[TrainState, Metrics]]
 

@@ -1,35 +1,16 @@
-"""A source, and its experience in the target task (paper Alg. 1, step 1)."""
+"""The experience of a source in the target task (paper Alg. 1, step 1)."""
 
 from __future__ import annotations
 
-import dataclasses
 import functools
-from pathlib import Path
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from twirl_mjx.evaluation import measures
-from twirl_mjx.tasks.vector import VectorEnv, make_transition
+from twirl_mjx.tasks import measures
 from twirl_mjx.types import SourcePolicy, Transition
-
-
-@dataclasses.dataclass(frozen=True)
-class Source:
-    """A resolved source: the policy, where it came from, and its run if it has one."""
-
-    policy: SourcePolicy
-    origin: str
-    digest: str
-    numpy_policy: Any = None
-    run_dir: Path | None = None
-
-    @property
-    def identity(self) -> dict[str, str]:
-        """What a run directory remembers of its source."""
-        return {"origin": self.origin, "digest": self.digest}
+from twirl_mjx.worlds.vector import VectorEnv, make_transition
 
 
 def collect(
@@ -54,7 +35,7 @@ def collect(
     """
     reset_key, key = jax.random.split(key)
     state = jax.jit(env.reset)(reset_key)
-    carry = (state, policy.init(state), measures.tracker_init(env.task.name, env.num_envs))
+    carry = (state, policy.init(state), measures.tracker_init(env.task, env.num_envs))
     chunk = min(200, -(-size // env.num_envs))
     run = jax.jit(functools.partial(_collect_chunk, env, policy, chunk))
     rows: list[Transition] = []
@@ -83,10 +64,10 @@ def _collect_chunk(
         state, memory, tracker = carry
         action, memory = policy.act(memory, state, step_key)
         result = env.step(state, action)
-        tracker = measures.tracker_step(env.task.name, tracker, result)
-        values = measures.tracker_read(env.task.name, tracker)
+        tracker = measures.tracker_step(env.task, tracker, result)
+        values = measures.tracker_read(env.task, tracker)
         ended = result.done & ~result.invalid
-        tracker = measures.tracker_reset(env.task.name, tracker, result.done)
+        tracker = measures.tracker_reset(env.task, tracker, result.done)
         out = (make_transition(state, action, result), ~result.invalid, ended, values)
         return (result, memory, tracker), out
 

@@ -9,8 +9,9 @@ import dataclasses
 from pathlib import Path
 
 from twirl_mjx.assets import asset_path
-from twirl_mjx.config import SCRIPTED_SOURCES, TrainConfig
-from twirl_mjx.presets import make_config, source_task_of, starts_from_nominal_run
+from twirl_mjx.policies.resolve import SCRIPTED_SOURCES
+from twirl_mjx.training.config import TrainConfig
+from twirl_mjx.training.presets import make_config, source_task_of, starts_from_nominal_run
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,15 +42,6 @@ class RunOf:
     config: TrainConfig
 
 
-COURSE_OPTIONS = {
-    "biped": ("goal_mean_radius", "goal_min_radius", "goal_max_radius", "fixed_goal"),
-    "hurdles": ("min_gap", "max_gap", "fixed_gap"),
-    "stand": ("risen_fraction",),
-    "imitate": ("standing_fraction",),
-}
-"""Options that only place robot, goals or hurdles; all others decide rewards or endings."""
-
-
 def check_replay_fits(config: TrainConfig, nominal: TrainConfig, run_dir: Path) -> None:
     """Check that the replay of a nominal run is experience of the task of ``config``.
 
@@ -66,8 +58,9 @@ def check_replay_fits(config: TrainConfig, nominal: TrainConfig, run_dir: Path) 
     task = config.task
     what = f" of task {nominal.task}" if nominal.task != task else ""
     if not what:
-        ours, theirs = (dataclasses.asdict(getattr(c, task)) for c in (config, nominal))
-        different = [k for k in ours if ours[k] != theirs[k] and k not in COURSE_OPTIONS[task]]
+        ours, theirs = vars(config.options), vars(nominal.options)
+        course = config.task_type.course_options
+        different = [k for k in ours if ours[k] != theirs[k] and k not in course]
         what = ", ".join(f" with {task}.{k} {theirs[k]!r} (here {ours[k]!r})" for k in different)
     if what:
         raise ValueError(
@@ -112,10 +105,10 @@ def source_of(config: TrainConfig, preset: str) -> NominalRun | Scripted | AtPat
         return AtPath(Path(config.source))
     task = source_task_of(config)
     plain = make_config(task, preset)
-    options = getattr(config, task)
-    if config.source == "auto" and preset != "debug" and options == getattr(plain, task):
+    options = config.source_options
+    if config.source == "auto" and preset != "debug" and options == plain.options:
         try:
             return AtPath(asset_path("policies", f"{task}.npz"), is_shipped=True)
         except FileNotFoundError:
             pass
-    return RunOf(dataclasses.replace(plain, seed=config.seed, **{task: options}))
+    return RunOf(dataclasses.replace(plain, seed=config.seed, options=options))

@@ -9,15 +9,15 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 
-from twirl_mjx.config import TrainConfig
 from twirl_mjx.droq import learner as droq
 from twirl_mjx.droq.state import DroqState
-from twirl_mjx.evaluation import measures
-from twirl_mjx.evaluation.measures import Tracker
 from twirl_mjx.replay import mixed, ring
 from twirl_mjx.replay.mixed import MixedReplay
-from twirl_mjx.tasks.vector import EnvState, VectorEnv, make_transition
+from twirl_mjx.tasks import measures
+from twirl_mjx.tasks.measures import Tracker
+from twirl_mjx.training.config import TrainConfig
 from twirl_mjx.types import Metrics
+from twirl_mjx.worlds.vector import EnvState, VectorEnv, make_transition
 
 
 class TrainState(flax.struct.PyTreeNode):
@@ -68,7 +68,7 @@ def init(
             source=source,
             online=ring.init(config.replay.capacity, env.observation_size, env.action_size),
         ),
-        tracker=measures.tracker_init(config.task, env.num_envs),
+        tracker=measures.tracker_init(env.task, env.num_envs),
         key=key,
         env_steps=jnp.zeros((), jnp.int32),
         inserted=jnp.zeros((), jnp.int32),
@@ -146,16 +146,16 @@ def train_step(
     """
     key, act_key, update_key = jax.random.split(state.key, 3)
     state, result = collect_step(config, env, state.replace(key=key), act_key)
-    tracker = measures.tracker_step(config.task, state.tracker, result)
+    tracker = measures.tracker_step(env.task, state.tracker, result)
     done = result.done & ~result.invalid
     finished = EpisodeSums(
         values={
             name: jnp.sum(jnp.where(done, value, 0.0))
-            for name, value in measures.tracker_read(config.task, tracker).items()
+            for name, value in measures.tracker_read(env.task, tracker).items()
         },
         count=jnp.sum(done, dtype=jnp.float32),
     )
-    state = state.replace(tracker=measures.tracker_reset(config.task, tracker, result.done))
+    state = state.replace(tracker=measures.tracker_reset(env.task, tracker, result.done))
     learner, learner_metrics = update_blocks(config, state, update_key)
     worlds = {f"world/{name}": jnp.mean(value) for name, value in result.metrics.items()}
     worlds |= {

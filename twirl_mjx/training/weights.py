@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
 
-from twirl_mjx.config import TrainConfig
 from twirl_mjx.droq.state import DroqState
 from twirl_mjx.policies.learned import NumpyPolicy, hidden_layers
-from twirl_mjx.presets import source_task_of
-from twirl_mjx.tasks.registry import make_task
+from twirl_mjx.policies.resolve import Source, config_of_source
+from twirl_mjx.tasks.observations import Entry
+from twirl_mjx.tasks.registry import TASKS
 from twirl_mjx.training.checkpoint import load_learner
-from twirl_mjx.training.source import Source
+from twirl_mjx.training.config import TrainConfig
+from twirl_mjx.training.presets import source_task_of
 from twirl_mjx.training.source_rules import AtPath, RunOf, source_of
 
 
@@ -29,19 +29,19 @@ def check_weights_fit(config: TrainConfig, preset: str) -> None:
     match source_of(config, preset):
         case AtPath(is_shipped=True) | RunOf():
             task = source_task_of(config)
-            check_layouts(config, task, f"the source task {task}")
+            layout = TASKS.get(task)(config.source_options).observer.layout
+            check_layouts(config, layout, f"the source task {task}")
 
 
-def check_layouts(config: TrainConfig, task: str, origin: str) -> None:
-    """Check that a policy of ``task`` observes what ``config.task`` shows.
+def check_layouts(config: TrainConfig, layout: tuple[Entry, ...], origin: str) -> None:
+    """Check that a policy that observes ``layout`` observes what ``config.task`` shows.
 
     Raises:
         ValueError: It does not; the message names ``origin``.
     """
-    own = make_task(dataclasses.replace(config, task=task)).observer.layout
-    if own != make_task(config).observer.layout:
+    if layout != config.make_task().observer.layout:
         raise ValueError(
-            f"{origin} observes as task {task}, not as {config.task}:"
+            f"{origin} observes something else than {config.task} shows:"
             " its weights do not fit (nearest variant: 'twirl')"
         )
 
@@ -57,10 +57,11 @@ def source_weights(
     Raises:
         ValueError: The source has no networks, or observations, layer sizes or critics differ.
     """
-    policy = source.numpy_policy
+    policy = source.loaded
     if not isinstance(policy, NumpyPolicy):
         raise ValueError(f"{source.origin} has no network weights (nearest variant: 'twirl')")
-    check_layouts(config, policy.header.task, source.origin)
+    own = config_of_source(config, policy.header, source.origin)
+    check_layouts(config, own.make_task().observer.layout, source.origin)
     sizes = tuple(
         len(policy.actor_params[name]["bias"]) for name in hidden_layers(policy.actor_params)
     )

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from brax.envs.base import Env, State
 
 from twirl_mjx.sim.engine import MjxEngine
-from twirl_mjx.tasks.vector import EnvState, VectorEnv
+from twirl_mjx.worlds.vector import EnvState, VectorEnv
 
 
 class BraxEnv(Env):

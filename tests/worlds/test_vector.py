@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from twirl_mjx.sim.dynamics import make_dynamics, stack
-from twirl_mjx.tasks.vector import EnvState, make_transition
+from twirl_mjx.worlds.vector import EnvState, make_transition
 
 Place = Callable[[EnvState, int, np.ndarray], EnvState]
 LIMIT = 400

@@ -16,7 +16,7 @@ from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import check_env
 
 from twirl_mjx.config import EnvConfig, TrainConfig
-from twirl_mjx.tasks.adapters import GymnasiumEnv, to_brax, to_gymnasium
+from twirl_mjx.worlds.adapters import GymnasiumEnv, to_brax, to_gymnasium
 
 LIMIT = 4
 CONFIG = TrainConfig(env=EnvConfig(episode_length=LIMIT))
@@ -102,7 +102,7 @@ def test_rendered_frame_shows_the_robot(gym: GymnasiumEnv, monkeypatch: pytest.M
 @pytest.fixture(scope="module")
 def brax_view(worlds: Callable[..., Any]) -> Any:
     """The batched view over the three compiled worlds of ``stand``."""
-    from twirl_mjx.tasks.brax_view import BraxEnv
+    from twirl_mjx.worlds.brax_view import BraxEnv
 
     made = worlds("stand")
     compiled: Any = SimpleNamespace(

@@ -14,8 +14,9 @@ from twirl_mjx.sim import actuation
 from twirl_mjx.sim.dynamics import Dynamics, broadcast
 from twirl_mjx.sim.engine import Engine, Trace, make_data, world_model
 from twirl_mjx.sim.scene import CONTROL_DT, Scene
-from twirl_mjx.tasks.base import Outcome, Task, World, make_view
+from twirl_mjx.tasks.base import Outcome, World, make_view
 from twirl_mjx.tasks.observations import layout_size
+from twirl_mjx.tasks.task import Task
 from twirl_mjx.types import Metrics, Transition
 
 MAX_STATE = 1e4
@@ -69,6 +70,7 @@ class VectorEnv:
         num_envs: int,
         episode_length: int,
         dynamics: Dynamics,
+        metric_names: tuple[str, ...],
     ) -> None:
         """Bind a task to a scene.
 
@@ -79,8 +81,10 @@ class VectorEnv:
             num_envs: N.
             episode_length: Control steps before truncation.
             dynamics: Default physical parameters of the worlds, leaves () or [N].
+            metric_names: Names of the metrics that the task reports (``check.check_task``).
         """
         self.task = task
+        self.metric_names = metric_names
         self.scene = scene
         self.engine = engine
         self.num_envs = num_envs
@@ -139,7 +143,7 @@ class VectorEnv:
             terminated=flags,
             truncated=flags,
             invalid=flags,
-            metrics={name: jnp.zeros(self.num_envs) for name in self.task.metric_names},
+            metrics={name: jnp.zeros(self.num_envs) for name in self.metric_names},
             world=world,
         )
 
@@ -171,7 +175,7 @@ class VectorEnv:
             invalid=invalid,
             metrics={
                 name: jnp.where(invalid, 0.0, outcome.metrics[name].astype(jnp.float32))
-                for name in self.task.metric_names
+                for name in self.metric_names
             },
             world=world,
         )

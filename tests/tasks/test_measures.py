@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from twirl_mjx.config import TASKS, TrainConfig
-from twirl_mjx.evaluation import measures
+from twirl_mjx.tasks import measures
 from twirl_mjx.tasks.registry import make_task
 
 

@@ -1,25 +1,18 @@
-"""Configs as JSON, and the difference between two of them."""
+"""Frozen dataclasses as plain values and back: what configs and options have in common."""
 
 from __future__ import annotations
 
 import contextlib
 import dataclasses
-import json
 import types
 import typing
 from typing import Any
 
 from twirl_mjx.checks import check_choice
-from twirl_mjx.config import TrainConfig
-
-
-def to_json(config: TrainConfig) -> str:
-    """Return the config as indented JSON with every field."""
-    return json.dumps(dataclasses.asdict(config), indent=2, sort_keys=True) + "\n"
 
 
 def from_dict(kind: type, values: dict[str, Any], where: str = "config") -> Any:
-    """Build a config dataclass from plain values (as JSON gives them).
+    """Build a dataclass from plain values (as JSON gives them).
 
     Raises:
         ValueError: An unknown key, with the nearest valid one, or a value of another type than
@@ -67,6 +60,8 @@ def check_type(field: str, value: Any, expected: Any) -> None:
 
 def _fits(value: Any, expected: Any) -> bool:
     origin, parts = typing.get_origin(expected), typing.get_args(expected)
+    if expected is Any:
+        return True
     if origin is typing.Literal:  # which of them is checked by the class, that names the nearest
         return isinstance(value, str)
     if origin in (typing.Union, types.UnionType):
@@ -79,39 +74,22 @@ def _fits(value: Any, expected: Any) -> bool:
     return type(value) is expected or (expected is float and type(value) is int)
 
 
-def from_json(text: str) -> TrainConfig:
-    """Read a config written by :func:`to_json`.
+def flatten(record: Any) -> dict[str, Any]:
+    """Return a dataclass and those in it as one flat dict with dotted keys."""
+    out: dict[str, Any] = {}
+    for field in dataclasses.fields(record):
+        value = getattr(record, field.name)
+        if dataclasses.is_dataclass(value):
+            out |= {f"{field.name}.{key}": inner for key, inner in flatten(value).items()}
+        else:
+            out[field.name] = value
+    return out
 
-    Raises:
-        ValueError: The text is not JSON, or holds an unknown key or a bad value.
+
+def departures(record: Any) -> dict[str, Any]:
+    """Return the fields of a dataclass that are not the default, flat.
+
+    What identifies it: a field that a later version adds, at its default, changes nothing.
     """
-    return from_dict(TrainConfig, json.loads(text))
-
-
-def diff(a: TrainConfig, b: TrainConfig) -> list[str]:
-    """Return one line ``key: a -> b`` for every field in which two configs differ."""
-    flat_a, flat_b = flatten(a), flatten(b)
-    return [f"{k}: {flat_a[k]!r} -> {flat_b[k]!r}" for k in flat_a if flat_a[k] != flat_b[k]]
-
-
-def departures(config: Any) -> dict[str, Any]:
-    """Return the fields of a config (or a part of one) that are not the default, flat.
-
-    What identifies a config: a field that a later version adds, at its default, changes nothing.
-    """
-    default = flatten(type(config)())
-    return {key: value for key, value in flatten(config).items() if value != default[key]}
-
-
-def flatten(config: Any) -> dict[str, Any]:
-    """Return a config (or a part of one) as a flat dict with dotted keys."""
-
-    def walk(value: Any, prefix: str) -> dict[str, Any]:
-        if not dataclasses.is_dataclass(value):
-            return {prefix[:-1]: value}
-        out: dict[str, Any] = {}
-        for field in dataclasses.fields(value):
-            out |= walk(getattr(value, field.name), f"{prefix}{field.name}.")
-        return out
-
-    return walk(config, "")
+    default = flatten(type(record)())
+    return {key: value for key, value in flatten(record).items() if value != default[key]}

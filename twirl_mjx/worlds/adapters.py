@@ -11,11 +11,11 @@ import mujoco
 import numpy as np
 from gymnasium.error import ResetNeeded
 
-from twirl_mjx.tasks.registry import make
-from twirl_mjx.tasks.vector import MAX_STATE, EnvState, VectorEnv
+from twirl_mjx.worlds.make import make
+from twirl_mjx.worlds.vector import MAX_STATE, EnvState, VectorEnv
 
 if TYPE_CHECKING:
-    from twirl_mjx.tasks.brax_view import BraxEnv
+    from twirl_mjx.worlds.brax_view import BraxEnv
 
 OBSERVATION_LIMIT = 10 * MAX_STATE
 """Bound of the observation box, in the units of the layout: no finite world ever reaches it."""
@@ -27,12 +27,12 @@ class GymnasiumEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     """One world of a task as a ``gymnasium.Env``.
 
     Observation: float32 [O] in the task's layout. Action: float32 [12] in [-1, 1]. ``info`` has
-    one float per name of the task's ``metric_names`` (every reward term, unweighted) and the bool
+    one float per name of the task's metrics (every reward term, unweighted) and the bool
     ``invalid``. A step that is not finite is reported as a truncation with ``invalid`` true,
     reward 0 and the previous observation.
     """
 
-    metadata = {"render_modes": ["rgb_array"], "render_fps": 20}  # noqa: RUF012 (gymnasium's form)
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 20}
 
     def __init__(self, env: VectorEnv, render_mode: str | None = None) -> None:
         """Wrap a batch of one world.
@@ -173,6 +173,6 @@ def to_brax(
     Raises:
         ValueError: An unknown name or a value out of range, with the nearest valid choice.
     """
-    from twirl_mjx.tasks.brax_view import BraxEnv  # brax takes seconds to import
+    from twirl_mjx.worlds.brax_view import BraxEnv  # brax takes seconds to import
 
     return BraxEnv(make(task, shift, num_envs or 1, **options), batched=num_envs is not None)

@@ -1,0 +1,204 @@
+"""Named things, built in or from a user's own file, and how such a file is loaded.
+
+A reference is ``path/to/file.py:Name``. A registry holds one kind of thing (tasks, shifts, ...) by
+name; a thing enters it by being registered where it is defined, by a reference, or through a
+package's entry point.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib
+import importlib.metadata
+import importlib.util
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from twirl_mjx.checks import check_choice, nearest
+
+
+def is_reference(text: str) -> bool:
+    """Return whether a text is of the form ``file.py:Name`` (not whether that exists)."""
+    return ".py:" in text or text.endswith(".py")
+
+
+def split(reference: str, kind: str = "object") -> tuple[Path, str]:
+    """Return file and name of a reference; the file exists.
+
+    Raises:
+        ValueError: No name is given, or there is no such file.
+    """
+    path_text, _, name = reference.rpartition(":")
+    if not path_text:
+        raise ValueError(f"{reference} does not say which {kind} (nearest: {reference}:Name)")
+    path = Path(path_text).expanduser().resolve()
+    if not path.is_file():
+        beside = [p.name for p in path.parent.glob("*.py")] if path.parent.is_dir() else []
+        hint = f" (nearest: {path.parent / nearest(path.name, beside)})" if beside else ""
+        raise ValueError(f"there is no file {path_text} to take the {kind} {name!r} from{hint}")
+    return path, name
+
+
+def load(reference: str, kind: str = "object") -> Any:
+    """Return the object a reference names; its file is run once in a process.
+
+    Args:
+        reference: ``path/to/file.py:Name``.
+        kind: What errors call the object.
+
+    Raises:
+        ValueError: No such file or name, or the file does not import. One line that names it.
+    """
+    path, name = split(reference, kind)
+    module = _module(path)
+    if not hasattr(module, name):
+        public = [key for key, value in vars(module).items()
+                  if not key.startswith("_") and not isinstance(value, ModuleType)]  # fmt: skip
+        hint = f" (nearest: {nearest(name, public)!r})" if public else ""
+        raise ValueError(f"{path} has no {kind} {name!r}{hint}")
+    return getattr(module, name)
+
+
+def _module(path: Path) -> ModuleType:
+    name = f"_twirl_{path.stem}_{hashlib.sha256(str(path).encode()).hexdigest()[:8]}"
+    if name in sys.modules:
+        return sys.modules[name]
+    spec = importlib.util.spec_from_file_location(name, path)
+    if spec is None or spec.loader is None:
+        raise ValueError(f"{path} is no Python file (nearest: a file that ends in .py)")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module  # dataclasses look their module up
+    sys.path.insert(0, str(path.parent))  # what lies beside the file can be imported
+    try:
+        spec.loader.exec_module(module)
+    except Exception as error:  # whatever a user's file may raise
+        del sys.modules[name]
+        what = " ".join(str(error).split())
+        raise ValueError(f"{path} does not import: {type(error).__name__}: {what}") from error
+    finally:
+        sys.path.remove(str(path.parent))
+    return module
+
+
+class Registry[T]:
+    """Things of one kind by name."""
+
+    def __init__(
+        self, kind: str, *, home: tuple[str, ...], accept: Callable[[Any], T], group: str
+    ) -> None:
+        """Make an empty registry.
+
+        Args:
+            kind: What messages call one of them, ``task`` say.
+            home: Modules whose import registers the built-in ones, in order.
+            accept: Returns the thing to keep for what was given; raises ValueError, saying what
+                was expected, where it does not fit.
+            group: Entry point group in which packages offer more.
+        """
+        self.kind = kind
+        self._home = home
+        self._accept = accept
+        self._group = group
+        self._items: dict[str, T] = {}
+        self._references: dict[str, str] = {}
+        self._is_home_loaded = not home
+
+    def register(self, item: Any) -> Any:
+        """Add a thing under its ``name`` and return it; usable as a decorator.
+
+        Raises:
+            ValueError: It does not fit, or another one has that name.
+        """
+        self._add(item, None)
+        return item
+
+    def _add(self, item: Any, reference: str | None) -> str:
+        where = f"{reference}: " if reference else ""
+        try:
+            accepted = self._accept(item)
+        except ValueError as error:
+            raise ValueError(f"{where}{error}") from None
+        name: str = accepted.name  # type: ignore[attr-defined]
+        known = self._items.get(name)
+        if known is not None and known is not accepted:
+            home = self._references.get(name, "built in")
+            raise ValueError(
+                f"{where}a {self.kind} {name!r} is there already ({home})"
+                f" (nearest: {'my_' + name!r})"
+            )
+        self._items[name] = accepted
+        if reference:
+            self._references[name] = reference
+        return name
+
+    def admit(self, text: str) -> str:
+        """Return the name of what a text names: a name, or a reference that is loaded now.
+
+        Raises:
+            ValueError: Nothing there, or nothing that fits; one line.
+        """
+        if is_reference(text):
+            path, name = split(text, self.kind)
+            self._load_home()
+            return self._add(load(text, self.kind), f"{path}:{name}")
+        self.get(text)
+        return text
+
+    def admit_if_fits(self, reference: str) -> str | None:
+        """Return the name of what a reference names, None where that is of another kind.
+
+        Raises:
+            ValueError: There is nothing to load.
+        """
+        try:
+            self._accept(load(reference))
+        except ValueError:
+            load(reference)  # refuses what cannot be loaded at all
+            return None
+        return self.admit(reference)
+
+    def get(self, name: str) -> T:
+        """Return the thing of that name.
+
+        Raises:
+            ValueError: Unknown name, with the nearest.
+        """
+        self._load_home()
+        if name not in self._items and (point := self._entry_points().get(name)) is not None:
+            self._add(point.load(), point.value)
+            self._references.pop(name, None)  # it is found by its name, in every process
+        check_choice(self.kind, name, self.names())
+        return self._items[name]
+
+    def names(self) -> tuple[str, ...]:
+        """Return all names: the built-in ones, then what was registered or is installed."""
+        self._load_home()
+        own = {name: self._home.index(_module_of(item)) for name, item in self._items.items()
+               if _module_of(item) in self._home}  # fmt: skip
+        return tuple(dict.fromkeys([*sorted(own, key=own.__getitem__), *self._items,
+                                    *self._entry_points()]))  # fmt: skip
+
+    def builtin_names(self) -> tuple[str, ...]:
+        """Return the names of those that this package brings."""
+        self._load_home()
+        return tuple(n for n, item in self._items.items() if _module_of(item) in self._home)
+
+    def reference(self, name: str) -> str | None:
+        """Return ``file.py:Name`` of a thing that came from a file, else None."""
+        return self._references.get(name)
+
+    def _load_home(self) -> None:
+        if not self._is_home_loaded:
+            self._is_home_loaded = True
+            for module in self._home:
+                importlib.import_module(module)
+
+    def _entry_points(self) -> dict[str, importlib.metadata.EntryPoint]:
+        return {point.name: point for point in importlib.metadata.entry_points(group=self._group)}
+
+
+def _module_of(item: Any) -> str:
+    return getattr(item, "__module__", "")

@@ -1,0 +1,94 @@
+"""Named settings: the paper's numbers, two CPU cores, and seconds for tests."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from twirl_mjx.checks import check_choice
+from twirl_mjx.tasks.registry import TASKS
+from twirl_mjx.training.config import TrainConfig
+from twirl_mjx.training.config_json import settle
+
+SETTINGS: dict[str, Mapping[str, Any]] = {
+    "paper": {},
+    "cpu": {  # sized for two cores (docs/lab-notes.md has the run behind each choice)
+        "total_env_steps": 1_200_000,
+        "warmup_env_steps": 6400,
+        "epoch_env_steps": 3200,
+        "num_envs": 64,
+        "droq.hidden_sizes": (128, 128),
+        "droq.utd": 0.5,
+        "droq.updates_per_block": 8,
+        "droq.initial_temperature": 0.1,
+        "droq.discount": 0.97,  # leaves the safe poor optimum of sitting
+        "eval.every": 96_000,
+        "eval.episodes": 32,
+    },
+    "debug": {
+        "total_env_steps": 96,
+        "warmup_env_steps": 32,
+        "epoch_env_steps": 32,
+        "num_envs": 4,
+        "episode_length": 20,
+        "droq.utd": 1.0,
+        "droq.updates_per_block": 4,
+        "droq.batch_size": 16,
+        "droq.hidden_sizes": (32, 32),
+        "replay.capacity": 1000,
+        "replay.source_size": 64,
+        "eval.every": 64,
+        "eval.episodes": 2,
+        "eval.final_episodes": 4,
+        "eval.episode_length": 20,
+        "checkpoint_minutes": 0.0,
+    },
+}
+"""Preset -> what departs from the defaults in every task; tasks have more (``Task.presets``)."""
+PRESETS = tuple(SETTINGS)
+
+
+def make_config(task: str, preset: str = "paper") -> TrainConfig:
+    """Return the config of a task under a preset.
+
+    Args:
+        task: Name of a task, or ``file.py:Name``.
+        preset: ``paper`` (the paper's numbers), ``cpu`` (the same method, settings for two CPU
+            cores) or ``debug`` (seconds, for tests).
+
+    Raises:
+        ValueError: Unknown task or preset, with the nearest valid name.
+    """
+    name = TASKS.admit(task)
+    check_choice("preset", preset, PRESETS)
+    kind = TASKS.get(name)
+    variant = "twirl" if kind.source else "scratch"
+    config = TrainConfig(task=name, variant=variant)
+    if kind.source:
+        source = make_config(kind.source, preset)
+        config = settle(config, {f"{kind.source}.{k}": v for k, v in vars(source.options).items()})
+    own = dict(kind.presets.get("paper", {})) | dict(kind.presets.get(preset, {}))
+    return settle(config, dict(SETTINGS[preset]) | own)
+
+
+def source_task_of(config: TrainConfig) -> str:
+    """Return the task whose policy is the source of a run that names none.
+
+    Raises:
+        ValueError: The task has no such source.
+    """
+    if config.task_type.source is None:
+        raise ValueError(
+            f"task {config.task} has no source policy of its own, so variant {config.variant!r}"
+            " needs one named with --source (nearest variant without: 'scratch')"
+        )
+    return config.task_type.source
+
+
+def starts_from_nominal_run(config: TrainConfig, preset: str) -> bool:
+    """Return whether a run adapts a finished run of its own task to a shift.
+
+    It does unless it names another source than the preset would without the shift.
+    """
+    plain = make_config(config.task, preset).source
+    return config.shift != "none" and config.source in ("auto", "train", plain)

@@ -1,0 +1,1 @@
+"""Vectorised worlds: a task in a scene under a dynamics, stepped by an engine."""

@@ -1,0 +1,100 @@
+"""Which worlds: task and options, dynamics, course, how many, and the engine that steps them."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any, Literal
+
+from twirl_mjx.checks import check_choice, check_range
+from twirl_mjx.sim.dynamics import get_shift
+from twirl_mjx.tasks.registry import TASKS
+from twirl_mjx.tasks.task import Task
+
+REGISTRIES = (TASKS,)
+"""What a config may name that can come from a user's own file."""
+
+
+@dataclasses.dataclass(frozen=True)
+class WorldConfig:
+    """Worlds of one task; nothing of it knows that anybody learns there."""
+
+    task: str = "biped"
+    """Name of the task, or file.py:Name of your own."""
+    options: Any = None
+    """Options of the task, of its own kind; the defaults when not given."""
+    shift: str = "none"
+    """Dynamics shift, by name, or file.py:NAME of your own."""
+    shift_strength: float = 1.0
+    """0 is nominal, 1 the paper's value."""
+    course: Literal["auto", "random", "fixed"] = "auto"
+    """Goals and hurdles; auto is random without a shift, fixed under one (README, deviations)."""
+    num_envs: int = 16
+    """Worlds stepped together."""
+    episode_length: int = 400
+    """Control steps before an episode is truncated (400: 20 s at 20 Hz)."""
+    engine: Literal["auto", "mjx", "native"] = "auto"
+    """Physics engine; auto is mjx on an accelerator and native (C MuJoCo threads) on a CPU."""
+    uses: tuple[str, ...] = ()
+    """file.py:Name of everything named above that is not built in; filled in by itself."""
+
+    def __post_init__(self) -> None:
+        """Check names and ranges, load what comes from files, and fill in the options.
+
+        Raises:
+            ValueError: With the value, what is allowed and the nearest valid choice.
+        """
+        for reference in self.uses:
+            for registry in REGISTRIES:
+                registry.admit_if_fits(reference)
+        self._set("task", TASKS.admit(self.task))
+        get_shift(self.shift)
+        self._set("uses", self._references())
+        if self.options is None:
+            self._set("options", self.task_type.Options())
+        self.task_type.check_options(self.options)
+        check_range("shift_strength", self.shift_strength, 0.0, 2.0)
+        check_range("num_envs", self.num_envs, 1, 1_000_000)
+        check_range("episode_length", self.episode_length, 1, 1_000_000)
+        check_choice("engine", self.engine, ("auto", "mjx", "native"))
+        check_choice("course", self.course, ("auto", "random", "fixed"))
+
+    def _set(self, name: str, value: Any) -> None:
+        object.__setattr__(self, name, value)
+
+    def _references(self) -> tuple[str, ...]:
+        found = [TASKS.reference(self.task)]
+        return tuple(sorted({*self.uses, *(f for f in found if f)}))
+
+    @property
+    def task_type(self) -> type[Task]:
+        """The class of the task."""
+        return TASKS.get(self.task)
+
+    @property
+    def fixed_course(self) -> bool:
+        """Whether goals and hurdles are fixed."""
+        if self.course == "auto":
+            return self.shift != "none"
+        return self.course == "fixed"
+
+    def make_task(self) -> Task:
+        """Return the task, bound to its options.
+
+        Raises:
+            ValueError: Options that do not fit one another.
+            FileNotFoundError: A file that they name does not exist.
+        """
+        return self.task_type(
+            self.options, fixed_course=self.fixed_course, episode_length=self.episode_length
+        )
+
+
+def world_fields(config: WorldConfig) -> Mapping[str, Any]:
+    """Return the fields of a config that say which worlds, whatever else it holds."""
+    return {field.name: getattr(config, field.name) for field in dataclasses.fields(WorldConfig)}
+
+
+def in_task[W: WorldConfig](config: W, task: str, options: Any = None) -> W:
+    """Return a config with another task, under that task's options (the defaults if not given)."""
+    return dataclasses.replace(config, task=task, options=options)

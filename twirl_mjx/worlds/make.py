@@ -1,0 +1,102 @@
+"""Worlds from a config, or from a few words."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any
+
+from twirl_mjx import records
+from twirl_mjx.sim.dynamics import SceneKind, get_shift, make_dynamics
+from twirl_mjx.sim.engine import make_engine
+from twirl_mjx.sim.scene import SimOptions, build_scene
+from twirl_mjx.tasks.registry import TASKS
+from twirl_mjx.tasks.task import Task
+from twirl_mjx.worlds.check import check_task
+from twirl_mjx.worlds.config import WorldConfig
+from twirl_mjx.worlds.vector import VectorEnv
+
+
+def make_env(
+    config: WorldConfig,
+    *,
+    num_envs: int | None = None,
+    scene_kind: SceneKind | None = None,
+    threads: int | None = None,
+) -> VectorEnv:
+    """Return the worlds a config describes.
+
+    Args:
+        config: Task, options, shift, course, episodes and engine.
+        num_envs: Worlds, ``config.num_envs`` by default.
+        scene_kind: Ground, that of the config's shift by default.
+        threads: Host threads of the native engine, all by default.
+
+    Raises:
+        ValueError: Options that do not fit, or a task whose methods return something of another
+            form than tasks must.
+    """
+    return _bind(config.make_task(), config, num_envs, scene_kind, threads)
+
+
+def _bind(
+    task: Task,
+    config: WorldConfig,
+    num_envs: int | None = None,
+    scene_kind: SceneKind | None = None,
+    threads: int | None = None,
+) -> VectorEnv:
+    kind = scene_kind or get_shift(config.shift).scene
+    scene = build_scene(kind, collision=task.collision, options=SimOptions())
+    return VectorEnv(
+        task,
+        scene,
+        make_engine(config.engine, scene, threads),
+        num_envs=num_envs or config.num_envs,
+        episode_length=config.episode_length,
+        dynamics=make_dynamics(config.shift, config.shift_strength),
+        metric_names=check_task(task, scene),
+    )
+
+
+def make(
+    task: str | type[Task] | Task,
+    shift: str | None = None,
+    num_envs: int | None = None,
+    *,
+    options: Any = None,
+    config: WorldConfig | None = None,
+    **settings: Any,
+) -> VectorEnv:
+    """Return vectorised worlds of a task.
+
+    Args:
+        task: Name, ``file.py:Name``, or a task of your own: the class, or an object of it, whose
+            options are taken.
+        shift: Name of a dynamics shift, or ``file.py:NAME``.
+        num_envs: Worlds stepped together.
+        options: Options of the task: an object of its ``Options``, or names and values.
+        config: Everything that is not given here; without it the defaults, no shift and 256 worlds.
+        **settings: Any other field of ``WorldConfig`` (``course``, ``episode_length``, ``engine``,
+            ``shift_strength``, ...).
+
+    Raises:
+        ValueError: An unknown name or a value out of range, with the nearest valid choice.
+    """
+    if isinstance(task, Task):
+        options = task.options if options is None else options
+    kind = task if isinstance(task, type) else type(task)
+    name = task if isinstance(task, str) else TASKS.register(kind).name
+    base = config or WorldConfig(task=name, num_envs=256)
+    name = TASKS.admit(name)
+    if options is None and name == base.task:
+        options = base.options
+    elif isinstance(options, Mapping):
+        options = records.from_dict(TASKS.get(name).Options, dict(options), f"options of {name}")
+    for key, value in (("shift", shift), ("num_envs", num_envs)):
+        if value is not None:
+            settings[key] = value
+    known = tuple(field.name for field in dataclasses.fields(WorldConfig))
+    for key in settings:
+        records.check_choice("option of make", key, known)
+    return make_env(dataclasses.replace(base, task=name, options=options, **settings))
