@@ -7,24 +7,24 @@ import json
 from collections.abc import Callable
 
 import pytest
-
-from twirl_mjx.training import config_json
 from twirl_mjx.config import (
     SCRIPTED_SOURCES,
     SOURCE_OF,
     TASKS,
-    BipedConfig,
+    BipedOptions,
     DroqConfig,
     EnvConfig,
     EvalConfig,
-    HurdlesConfig,
-    ImitateConfig,
+    HurdlesOptions,
+    ImitateOptions,
     ReplayConfig,
     TrainConfig,
 )
 from twirl_mjx.config import SHIFTS as SHIFT_NAMES
-from twirl_mjx.training.presets import PRESETS, make_config
+
 from twirl_mjx.sim.dynamics import SHIFTS
+from twirl_mjx.training import config_json
+from twirl_mjx.training.presets import PRESETS, make_config
 
 
 @pytest.mark.parametrize("task", TASKS)
@@ -32,7 +32,7 @@ from twirl_mjx.sim.dynamics import SHIFTS
 def test_every_preset_builds_and_gives_whole_updates(task: str, preset: str) -> None:
     config = make_config(task, preset)
     assert config.task == task
-    assert config.updates_per_step == pytest.approx(config.droq.utd * config.env.num_envs)
+    assert config.updates_per_step == pytest.approx(config.droq.utd * config.num_envs)
     assert config.blocks_per_step * config.droq.updates_per_block == config.updates_per_step
     sourced = task in SOURCE_OF or config.source in SCRIPTED_SOURCES
     assert config.variant == ("twirl" if sourced else "scratch")
@@ -81,7 +81,7 @@ def test_updates_that_do_not_divide_are_refused_with_the_numbers() -> None:
     with pytest.raises(ValueError, match=r"1\.25 x env\.num_envs 16 = 20 .*block 16 .*utd 1\)"):
         TrainConfig(droq=DroqConfig(utd=1.25, updates_per_block=16))
     with pytest.raises(ValueError, match="whole number"):
-        TrainConfig(env=EnvConfig(num_envs=1), droq=DroqConfig(utd=0.5, updates_per_block=1))
+        TrainConfig(num_envs=1, droq=DroqConfig(utd=0.5, updates_per_block=1))
 
 
 def test_the_nearest_utd_is_accepted() -> None:
@@ -105,7 +105,7 @@ def test_variants_decide_phi() -> None:
 def test_course_is_fixed_under_a_shift() -> None:
     assert not TrainConfig().fixed_course
     assert TrainConfig(shift="icy").fixed_course
-    assert not TrainConfig(shift="icy", env=EnvConfig(course="random")).fixed_course
+    assert not TrainConfig(shift="icy", course="random").fixed_course
 
 
 @pytest.mark.parametrize("preset", PRESETS)
@@ -169,20 +169,20 @@ def test_diff_names_every_field_that_differs() -> None:
     ("build", "match"),
     [
         (
-            lambda: BipedConfig(goal_min_radius=6.0),
+            lambda: BipedOptions(goal_min_radius=6.0),
             r"radius = 6.0 is outside \[0.0, 5.0\]",
         ),
-        (lambda: BipedConfig(goal_mean_radius=-1.0), "goal_mean_radius = -1.0 is outside"),
-        (lambda: ImitateConfig(max_root_error=0.0), "max_root_error = 0.0 is outside"),
-        (lambda: ImitateConfig(standing_fraction=1.5), "standing_fraction = 1.5 is outside"),
-        (lambda: HurdlesConfig(hurdle_bonus="evnt"), "nearest: 'event'"),  # type: ignore[arg-type]
+        (lambda: BipedOptions(goal_mean_radius=-1.0), "goal_mean_radius = -1.0 is outside"),
+        (lambda: ImitateOptions(max_root_error=0.0), "max_root_error = 0.0 is outside"),
+        (lambda: ImitateOptions(standing_fraction=1.5), "standing_fraction = 1.5 is outside"),
+        (lambda: HurdlesOptions(hurdle_bonus="evnt"), "nearest: 'event'"),  # type: ignore[arg-type]
         (
             lambda: TrainConfig(total_env_steps=110_000_000),
             r"total_env_steps = 110000000 is outside \[1, 107372182\]",  # UTD 20: counts in int32
         ),
         (lambda: TrainConfig(warmup_env_steps=2**31), "warmup_env_steps = 2147483648 is outside"),
-        (lambda: BipedConfig(fixed_goal=(float("nan"), 0.0)), "fixed_goal = nan is outside"),
-        (lambda: HurdlesConfig(max_gap=float("inf")), "max_gap = inf is outside"),
+        (lambda: BipedOptions(fixed_goal=(float("nan"), 0.0)), "fixed_goal = nan is outside"),
+        (lambda: HurdlesOptions(max_gap=float("inf")), "max_gap = inf is outside"),
         (lambda: DroqConfig(target_entropy=float("-inf")), "target_entropy = -inf is outside"),
         (lambda: EvalConfig(seed=2**32), "eval.seed = 4294967296 is outside"),
     ],

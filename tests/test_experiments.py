@@ -84,7 +84,7 @@ def test_axes_have_the_papers_values() -> None:
     assert sorted({d.config.replay.phi for d in phi}) == [0.0, 0.25, 0.5, 0.75]
     assert sorted({d.config.droq.utd for d in utd}) == [1, 5, 10, 20]
     # one actor update per transition at every UTD
-    assert all(d.config.blocks_per_step == d.config.env.num_envs for d in utd)
+    assert all(d.config.blocks_per_step == d.config.num_envs for d in utd)
     shifts = {(d.config.task, d.config.shift, d.config.variant) for d in load("shifts").drafts}
     assert shifts == set(
         itertools.product(
@@ -103,7 +103,7 @@ def test_reduced_form_is_smaller_and_says_so(name: str) -> None:
         assert draft.config.total_env_steps < full[draft.arm].total_env_steps
         # budgets are whole epochs, so that runs end where they say
         config = draft.config
-        assert config.total_env_steps % (config.steps_per_epoch * config.env.num_envs) == 0
+        assert config.total_env_steps % (config.steps_per_epoch * config.num_envs) == 0
     trained = [d for d in grid.drafts if d.config.variant != "zero-shot"]
     fewest = 1 if name == "shifts" else 2  # its budget is nearly the paper's instead
     assert all(

@@ -10,19 +10,33 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from twirl_mjx.policies.learned import load_policy as load_policy
+    from twirl_mjx.tasks.base import Outcome as Outcome
+    from twirl_mjx.tasks.base import Start as Start
+    from twirl_mjx.tasks.task import Measure as Measure
+    from twirl_mjx.tasks.task import Task as Task
+    from twirl_mjx.training.api import RunResult as RunResult
+    from twirl_mjx.training.api import train as train
     from twirl_mjx.worlds.adapters import to_brax as to_brax
     from twirl_mjx.worlds.adapters import to_gymnasium as to_gymnasium
+    from twirl_mjx.worlds.config import WorldConfig as WorldConfig
     from twirl_mjx.worlds.make import make as make
 
-__version__ = "0.1.0"
-__all__ = ["load_policy", "make", "to_brax", "to_gymnasium"]
+__version__ = "0.2.0"
 
 _HOMES = {
-    "make": "twirl_mjx.worlds.make",
+    "Measure": "twirl_mjx.tasks.task",
+    "Outcome": "twirl_mjx.tasks.base",
+    "RunResult": "twirl_mjx.training.api",
+    "Start": "twirl_mjx.tasks.base",
+    "Task": "twirl_mjx.tasks.task",
+    "WorldConfig": "twirl_mjx.worlds.config",
     "load_policy": "twirl_mjx.policies.learned",
-    "to_gymnasium": "twirl_mjx.worlds.adapters",
+    "make": "twirl_mjx.worlds.make",
     "to_brax": "twirl_mjx.worlds.adapters",
+    "to_gymnasium": "twirl_mjx.worlds.adapters",
+    "train": "twirl_mjx.training.api",
 }
+__all__ = sorted(_HOMES)  # pyright: ignore[reportUnsupportedDunderAll]
 
 
 def __getattr__(name: str) -> Any:

@@ -13,8 +13,8 @@ from twirl_mjx.bench import epoch, startup
 from twirl_mjx.bench.epoch import EpochBench
 from twirl_mjx.bench.startup import StartupBench
 from twirl_mjx.commands.options import parse_train
-from twirl_mjx.training.presets import PRESETS, make_config
 from twirl_mjx.training.metrics import COLUMNS
+from twirl_mjx.training.presets import PRESETS, make_config
 
 HEADER = ",".join(COLUMNS)
 
@@ -31,7 +31,7 @@ def test_child_updates_in_its_first_epoch_at_the_preset_s_shapes(
     assert options.preset == preset
     assert config.steps_per_epoch == 2
     # The first vector step ends the warm-up, the second is followed by updates.
-    assert config.warmup_env_steps == config.env.num_envs
+    assert config.warmup_env_steps == config.num_envs
     assert config.updates_per_step >= 1
 
 
@@ -77,7 +77,7 @@ def test_child_gets_the_cache_of_the_measurement(
 def test_epoch_is_short_and_past_the_warm_up() -> None:
     for preset in PRESETS:
         config = EpochBench(preset=preset).config
-        assert config.warmup_env_steps == config.env.num_envs
+        assert config.warmup_env_steps == config.num_envs
         assert config.steps_per_epoch * config.updates_per_step <= max(640, config.updates_per_step)
         assert config.droq == make_config("stand", preset).droq
 

@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from twirl_mjx.droq.config import DroqConfig
 from twirl_mjx.droq import dropout, fast, fused, learner, packing, plain
+from twirl_mjx.droq.config import DroqConfig
 from twirl_mjx.droq.state import CriticState
 
 OBS_SIZE, ACTION_SIZE, U = 5, 2, 4

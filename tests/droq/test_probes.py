@@ -14,8 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from twirl_mjx.droq.config import DroqConfig
 from twirl_mjx.droq import fast, learner, plain
+from twirl_mjx.droq.config import DroqConfig
 from twirl_mjx.types import Transition
 
 BATCH, U, BLOCKS = 64, 10, 60

@@ -11,10 +11,10 @@ import pytest
 
 from twirl_mjx.commands import evaluate
 from twirl_mjx.commands.render import config_of, name_of
-from twirl_mjx.training.config import TrainConfig
 from twirl_mjx.policies.learned import PolicyFileError, PolicyHeader, save_policy
-from twirl_mjx.training.presets import make_config
 from twirl_mjx.training import rundir
+from twirl_mjx.training.presets import make_config
+from twirl_mjx.worlds.config import WorldConfig
 
 
 def save(path: Path, task: str = "stand", **card: object) -> str:
@@ -25,18 +25,18 @@ def save(path: Path, task: str = "stand", **card: object) -> str:
 
 
 def make_run(path: Path) -> Path:
-    rundir.open_run(path, make_config("stand", "debug"))
+    rundir.RunDir(path).open(make_config("stand", "debug"))
     save(path / "policy.npz")
     save(path / "policy_last.npz")
     return path
 
 
 @pytest.fixture
-def scored(monkeypatch: pytest.MonkeyPatch) -> list[TrainConfig]:
+def scored(monkeypatch: pytest.MonkeyPatch) -> list[WorldConfig]:
     """The configs that policies were scored under; nothing is simulated."""
-    configs: list[TrainConfig] = []
+    configs: list[WorldConfig] = []
 
-    def score(config: TrainConfig, policy: object, *, shifts: Any, episodes: int, **_: object):
+    def score(config: WorldConfig, policy: object, *, shifts: Any, episodes: int, **_: object):
         configs.append(config)
         return {shift: {"return": np.arange(float(episodes))} for shift in shifts}
 
@@ -52,7 +52,7 @@ def run(out: Path, *words: str) -> list[dict[str, str]]:
 
 
 def test_a_bad_name_is_found_before_anything_is_scored(
-    scored: list[TrainConfig], tmp_path: Path
+    scored: list[WorldConfig], tmp_path: Path
 ) -> None:
     out, good = tmp_path / "out" / "table.csv", save(tmp_path / "good.npz")
     with pytest.raises(FileNotFoundError, match="nowhere"):
@@ -61,17 +61,17 @@ def test_a_bad_name_is_found_before_anything_is_scored(
     with pytest.raises(PolicyFileError, match="foreign"):
         run(out, good, str(tmp_path / "foreign.npz"))
     with pytest.raises(ValueError, match="option of task biped"):
-        run(out, "trot", good, "--task", "stand", "--goal-distance", "1")
+        run(out, "trot", good, "--task", "stand", "--biped.goal-distance", "1")
     assert not scored
     assert not out.parent.exists()
 
 
 def test_what_is_done_is_kept_when_a_later_policy_fails(
-    scored: list[TrainConfig], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    scored: list[WorldConfig], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     score = evaluate.evaluate_shifts
 
-    def fail_later(config: TrainConfig, policy: Any, **words: Any) -> Any:
+    def fail_later(config: WorldConfig, policy: Any, **words: Any) -> Any:
         if len(scored) == 2:
             raise RuntimeError("the third")
         return score(config, policy, **words)
@@ -88,7 +88,7 @@ def test_what_is_done_is_kept_when_a_later_policy_fails(
 
 
 def test_runs_have_the_names_of_their_directories(
-    scored: list[TrainConfig], tmp_path: Path
+    scored: list[WorldConfig], tmp_path: Path
 ) -> None:
     a, b = make_run(tmp_path / "a"), make_run(tmp_path / "biped-phi0.25-s0")
     words = [str(a / "policy.npz"), str(b), str(a / "policy_last.npz"), "trot"]
@@ -100,7 +100,7 @@ def test_runs_have_the_names_of_their_directories(
 
 @pytest.mark.parametrize(("first", "second"), [("a", "a/policy.npz"), ("a", "c/a")])
 def test_policies_that_the_table_cannot_tell_apart_are_refused(
-    first: str, second: str, scored: list[TrainConfig], tmp_path: Path
+    first: str, second: str, scored: list[WorldConfig], tmp_path: Path
 ) -> None:
     make_run(tmp_path / "a")
     make_run(tmp_path / "c" / "a")
@@ -120,19 +120,19 @@ def test_names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_a_policy_file_is_scored_by_its_own_options(
-    scored: list[TrainConfig], tmp_path: Path
+    scored: list[WorldConfig], tmp_path: Path
 ) -> None:
     card = {"seed": 7, "env_steps": 64, "variant": "scratch"}
     for height in ("root", "front_feet"):
         path = save(tmp_path / f"{height}.npz", options={"height_of": height}, **card)
         rows = run(tmp_path / "table.csv", path)
-        assert scored.pop().stand.height_of == height
+        assert scored.pop().options.height_of == height
         told = {tuple(row[k] for k in ("variant", "seed", "env_steps")) for row in rows}
         assert told == {("scratch", "7", "64")}
     path = save(tmp_path / "root.npz", options={"height_of": "root"})
-    assert config_of(path, "stand").stand.height_of == "root"
+    assert config_of(path, "stand").options.height_of == "root"
     foreign = config_of(path, "biped")  # in another task the paper's options of that task
-    assert foreign == make_config("biped")
+    assert foreign.options == make_config("biped").options
 
 
 def test_a_policy_file_of_an_unknown_task_is_named(tmp_path: Path) -> None:

@@ -10,7 +10,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from twirl_mjx.config import EnvConfig
 from twirl_mjx.evaluation.record import record_episode
 from twirl_mjx.evaluation.rollout import make_evaluate
 from twirl_mjx.evaluation.shifts import evaluate_shifts, scenes_of
@@ -23,7 +22,7 @@ from twirl_mjx.worlds.vector import EnvState
 @pytest.fixture(scope="module")
 def config():
     base = make_config("biped", "debug")
-    return dataclasses.replace(base, env=EnvConfig(num_envs=4, episode_length=12))
+    return dataclasses.replace(base.evaluation, num_envs=4, episode_length=12)
 
 
 def test_scenes_group_the_shifts() -> None:
@@ -51,7 +50,7 @@ def test_a_broken_step_is_no_measurement(config) -> None:
 def test_only_the_first_episode_counts() -> None:
     """Random actions end `stand` within a few steps; later episodes must leave no trace."""
     base = make_config("stand", "debug")
-    config = dataclasses.replace(base, env=EnvConfig(num_envs=4, episode_length=60))
+    config = dataclasses.replace(base.evaluation, num_envs=4, episode_length=60)
     env = make_env(config, num_envs=3)
 
     def act(params: Any, memory: Any, state: EnvState, key: jax.Array) -> tuple:

@@ -4,21 +4,20 @@ from __future__ import annotations
 
 import dataclasses
 from types import SimpleNamespace
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from twirl_mjx.evaluation.rollout import make_evaluate
+from twirl_mjx.evaluation.rollout import evaluate_policy
 from twirl_mjx.motion.clip import sample
 from twirl_mjx.motion.leap_checks import feed_forward, inverse_dynamics
 from twirl_mjx.policies.clip import ClipPolicy
 from twirl_mjx.policies.resolve import resolve_policy
-from twirl_mjx.training.presets import make_config
 from twirl_mjx.sim import a1
 from twirl_mjx.tasks.imitate import load_clip, standing_time
+from twirl_mjx.training.presets import make_config
 from twirl_mjx.worlds.make import make_env
 
 STEP = 0.05
@@ -68,21 +67,17 @@ def test_it_plays_the_planned_actions_and_starts_anew_in_a_new_episode(policy: C
 
 def test_it_tracks_better_than_chance_but_not_for_long() -> None:
     config = make_config("imitate", "cpu")
-    env = make_env(config, num_envs=24, threads=1)
+    env = make_env(config.evaluation, num_envs=24, threads=1)
     found = {}
     for name in ("clip", "random"):
         policy = resolve_policy(name, config).policy
-
-        def act(params: None, memory: Any, state: Any, key: jax.Array, policy: Any = policy) -> Any:
-            return policy.act(memory, state, key)
-
-        found[name] = make_evaluate(env, policy.init, act)(None, jax.random.key(5))
+        found[name] = evaluate_policy(env, policy)(jax.random.key(5))
     assert found["clip"]["tracking"].mean() > 2.0 * found["random"]["tracking"].mean()
     assert found["clip"]["terminated"].mean() > 0.9
 
 
 def test_the_clip_is_the_one_of_the_config() -> None:
     config = make_config("imitate", "cpu")
-    missing = dataclasses.replace(config.imitate, clip="no/such/clip.json")
+    missing = dataclasses.replace(config.options, clip="no/such/clip.json")
     with pytest.raises(FileNotFoundError, match="no/such/clip"):
-        resolve_policy("clip", dataclasses.replace(config, imitate=missing))
+        resolve_policy("clip", dataclasses.replace(config, options=missing))

@@ -12,12 +12,13 @@ import numpy as np
 import pytest
 
 from twirl_mjx.assets import asset_path
-from twirl_mjx.config import ImitateConfig
 from twirl_mjx.droq import networks
 from twirl_mjx.motion.formats import read_clip, write_clip
 from twirl_mjx.policies.learned import PolicyFileError, PolicyHeader, load_policy, save_policy
 from twirl_mjx.policies.resolve import config_of_card, config_of_source, resolve_policy
 from twirl_mjx.policies.source import ObservingSource, OwnTaskSource
+from twirl_mjx.tasks.imitate import ImitateOptions
+from twirl_mjx.tasks.stand import StandOptions
 from twirl_mjx.training.presets import make_config
 
 
@@ -42,7 +43,7 @@ def test_in_a_foreign_task_it_brings_its_observer_and_its_options(tmp_path: Path
     clip = tmp_path / "mine.json"
     leap = read_clip(asset_path("a1", "leap.json"))
     write_clip(dataclasses.replace(leap, frame_duration=2 * leap.frame_duration), clip)
-    options = dataclasses.asdict(ImitateConfig(clip=str(clip)))
+    options = dataclasses.asdict(ImitateOptions(clip=str(clip)))
     path = save(tmp_path / "imitate.npz", "imitate", 160, options=options)
     found = resolve_policy(str(path), make_config("hurdles", "cpu"))
     assert isinstance(found.policy, ObservingSource)
@@ -50,25 +51,23 @@ def test_in_a_foreign_task_it_brings_its_observer_and_its_options(tmp_path: Path
 
 
 def test_options_come_back_from_json_as_they_were(tmp_path: Path) -> None:
-    options = dataclasses.asdict(make_config("biped").biped) | {"fixed_goal": (2.0, 1.0)}
+    options = dataclasses.asdict(make_config("biped").options) | {"fixed_goal": (2.0, 1.0)}
     path = save(tmp_path / "biped.npz", "biped", 101, options=options)
     header = load_policy(path).header
     own = config_of_source(make_config("hurdles"), header)
     assert own.task == "biped"
-    assert own.biped.fixed_goal == (2.0, 1.0)
+    assert own.options.fixed_goal == (2.0, 1.0)
     hash(own)
 
 
 def test_card_gives_the_options_of_its_own_task(tmp_path: Path) -> None:
     path = save(tmp_path / "stand.npz", "stand", 101, options={"height_of": "root"})
     config = config_of_card(load_policy(path).header, str(path))
-    assert config == dataclasses.replace(
-        make_config("stand"),
-        stand=dataclasses.replace(make_config("stand").stand, height_of="root"),
-    )
-    assert make_config("stand").stand.height_of == "front_feet"
+    assert (config.task, config.options) == ("stand", StandOptions(height_of="root"))
+    assert make_config("stand").options.height_of == "front_feet"
     path = save(tmp_path / "old.npz", "stand", 101)  # cards did not always have options
-    assert config_of_card(load_policy(path).header, str(path)) == make_config("stand")
+    config = config_of_card(load_policy(path).header, str(path))
+    assert config.options == make_config("stand").options
 
 
 @pytest.mark.parametrize(

@@ -10,9 +10,8 @@ import pytest
 
 from twirl_mjx.assets import asset_path
 from twirl_mjx.policies.learned import NumpyPolicy, load_policy
-from twirl_mjx.training.presets import make_config
 from twirl_mjx.tasks.observations import layout_size
-from twirl_mjx.tasks.registry import make_task
+from twirl_mjx.training.presets import make_config
 
 FILES = sorted(asset_path("policies").glob("*.npz"))
 
@@ -30,6 +29,6 @@ def test_every_policy_loads_and_fits_its_task(path: Path) -> None:
     assert isinstance(policy, NumpyPolicy)
     task = policy.header.task
     assert path.stem.startswith(task)
-    observer = make_task(make_config(task)).observer
+    observer = make_config(task).make_task().observer
     assert policy.observation_size == layout_size(observer.layout)
     assert policy.header.card["evaluation"]["return"] > 0

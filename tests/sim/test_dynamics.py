@@ -7,8 +7,8 @@ import dataclasses
 import jax.numpy as jnp
 import numpy as np
 import pytest
-
 from twirl_mjx.config import SHIFTS as CONFIG_SHIFTS
+
 from twirl_mjx.sim.dynamics import (
     NOMINAL_VALUES,
     SHIFTS,

@@ -10,9 +10,9 @@ from typing import Any
 
 import pytest
 
-from twirl_mjx.training import config_json
 from twirl_mjx.sweep.plan import Cell
 from twirl_mjx.sweep.worker import Ending, Job, run_job
+from twirl_mjx.training import config_json
 
 GRID = '''
 """Two arms, two seeds, and a third arm with one."""

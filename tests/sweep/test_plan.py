@@ -9,11 +9,11 @@ from pathlib import Path
 import pytest
 
 from twirl_mjx.commands.sweep import main, wanted
-from twirl_mjx.training.presets import make_config
 from twirl_mjx.sweep import plan
 from twirl_mjx.sweep.grid import Draft, load
 from twirl_mjx.sweep.plan import Cell, make_plan, status_of
 from twirl_mjx.training import rundir, source_rules
+from twirl_mjx.training.presets import make_config
 
 Finish = Callable[..., Path]
 

@@ -14,13 +14,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from twirl_mjx.training.config import TrainConfig
 from twirl_mjx.sim import a1
 from twirl_mjx.sim.dynamics import Dynamics, make_dynamics
 from twirl_mjx.sim.scene import build_scene
 from twirl_mjx.tasks import base
-from twirl_mjx.tasks.base import Outcome, Task
+from twirl_mjx.tasks.base import Outcome
 from twirl_mjx.tasks.biped import BipedState
+from twirl_mjx.tasks.task import Task
+from twirl_mjx.worlds.config import WorldConfig
 from twirl_mjx.worlds.make import make
 from twirl_mjx.worlds.vector import EnvState
 
@@ -29,7 +30,7 @@ class Worlds:
     """Native worlds with compiled reset and step; ``traces`` counts how often each was traced."""
 
     def __init__(self, task: str, num_envs: int, **options: Any) -> None:
-        config = TrainConfig(task=task, **options)
+        config = WorldConfig(task=task, **options)
         self.env = make(task, num_envs=num_envs, engine="native", config=config)
         self.traces = {"reset": 0, "step": 0}
         self._reset = jax.jit(functools.partial(self._counted, "reset", self.env.reset))
@@ -70,7 +71,7 @@ def read() -> Callable[[EnvState], SimpleNamespace]:
 
 @pytest.fixture(scope="session")
 def worlds() -> Callable[..., Worlds]:
-    """``worlds("stand", num_envs=3, **fields of TrainConfig)``, compiled at first use."""
+    """``worlds("stand", num_envs=3, **fields of WorldConfig)``, compiled at first use."""
     made: dict[str, Worlds] = {}
 
     def get(task: str, num_envs: int = 3, **options: Any) -> Worlds:
@@ -183,7 +184,7 @@ def judge() -> Callable[..., Outcome]:
         return task.judge(world, view, scene)
 
     def run(task: Any, qpos: Any, goal: Any = (1.0, 0.0), previous: float = 0.0) -> Outcome:
-        key = (task.name, task._config)
+        key = (task.name, task.options, task.fixed_course)
         if key not in compiled:
             compiled[key] = jax.jit(jax.vmap(functools.partial(one, task), (0, None, None)))
         poses = np.array(qpos, np.float32)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable
 from typing import Any
 
@@ -12,12 +11,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from twirl_mjx.config import BipedConfig, EnvConfig, TrainConfig
 from twirl_mjx.sim import a1
 from twirl_mjx.tasks.base import Outcome
-from twirl_mjx.tasks.biped import Biped, draw_goal
-
-CONFIG = TrainConfig(task="biped")
+from twirl_mjx.tasks.biped import Biped, BipedOptions
+from twirl_mjx.tasks.goals import GoalOptions, draw_goal
+from twirl_mjx.worlds.config import WorldConfig
 
 
 def numpy_terms(qpos: np.ndarray, goal: np.ndarray, previous: float) -> dict[str, float]:
@@ -69,7 +67,7 @@ def raised(x: float, pitch_up: float = 90.0, z: float = 0.5) -> np.ndarray:
 
 def test_reward_by_hand(judge: Callable[..., Outcome]) -> None:
     """Goal 1 m ahead; nose up at 0.5 m: r_stand = 1.6487213, the belly faces +x."""
-    task = Biped(CONFIG)
+    task = Biped()
     outcome = judge(task, [raised(0.2), raised(1.5), raised(1.005)], previous=0.9)
     # nearer and facing; nearer but the goal is behind; at the goal with it 5 mm behind
     expected = 1.6487213 * np.array([1.0 + 1.0 + 0.5, 1.0 + 0.0 + 0.5, 1.0 + 0.0 + 1.0])
@@ -86,14 +84,14 @@ def test_reward_by_hand(judge: Callable[..., Outcome]) -> None:
 def test_goal_is_reached_within_a_centimetre(
     judge: Callable[..., Outcome], gap: float, value: float
 ) -> None:
-    outcome = judge(Biped(CONFIG), [raised(1.0 - gap)], previous=0.5)
+    outcome = judge(Biped(), [raised(1.0 - gap)], previous=0.5)
     assert outcome.metrics["distance"] == pytest.approx(value)
 
 
 def test_knees_may_touch_the_ground_but_nothing_above_them(
     judge: Callable[..., Outcome], poses: dict[str, np.ndarray]
 ) -> None:
-    outcome = judge(Biped(CONFIG), list(poses.values()))
+    outcome = judge(Biped(), list(poses.values()))
     assert dict(zip(poses, outcome.terminated.tolist(), strict=True)) == {
         "on four feet": False,
         "on the hind feet": False,
@@ -105,17 +103,17 @@ def test_knees_may_touch_the_ground_but_nothing_above_them(
     }
 
 
-def draw_goals(config: TrainConfig, count: int) -> np.ndarray:
+def draw_goals(options: GoalOptions, count: int, *, fixed: bool = False) -> np.ndarray:
     """Return the displacements [count, 2] in m of goals drawn around (2, -3)."""
     start = jnp.array([2.0, -3.0])
     keys = jax.random.split(jax.random.key(2), count)
-    goals = jax.jit(jax.vmap(lambda key: draw_goal(key, config, start)))(keys)
+    goals = jax.jit(jax.vmap(lambda key: draw_goal(key, options, start, fixed_course=fixed)))(keys)
     return np.asarray(goals - start)
 
 
 def test_goals_lie_on_a_circle_of_random_radius() -> None:
     """radius = clip(Exp(1.5), 0.3, 5): mean 0.3 + 1.5 (e^-0.2 - e^(-10/3)) = 1.47459 m."""
-    displacement = draw_goals(CONFIG, 20_000)
+    displacement = draw_goals(GoalOptions(), 20_000)
     radius = np.hypot(*displacement.T)
     assert radius.min() == pytest.approx(0.3, abs=1e-5)
     assert radius.max() == pytest.approx(5.0, abs=1e-5)
@@ -127,22 +125,27 @@ def test_goals_lie_on_a_circle_of_random_radius() -> None:
     np.testing.assert_allclose(counts, 2500, rtol=0.08)
 
 
+def test_fixed_course() -> None:
+    def fixed(**options: Any) -> np.ndarray:
+        return draw_goals(BipedOptions(**options), 20, fixed=True)
+
+    np.testing.assert_allclose(fixed(), np.tile([1.5, 0.0], (20, 1)), atol=1e-6)
+    np.testing.assert_allclose(
+        fixed(fixed_goal=(0.5, 2.0)), np.tile([0.5, 2.0], (20, 1)), atol=1e-6
+    )
+    np.testing.assert_allclose(fixed(goal_distance=3.0), np.tile([3.0, 0.0], (20, 1)), atol=1e-6)
+
+
 @pytest.mark.parametrize(
-    "config",
-    [
-        TrainConfig(task="biped", shift="icy"),
-        TrainConfig(task="biped", env=EnvConfig(course="fixed")),
-    ],
-)
-def test_fixed_course(config: TrainConfig) -> None:
-    np.testing.assert_allclose(draw_goals(config, 20), np.tile([1.5, 0.0], (20, 1)), atol=1e-6)
-    moved = dataclasses.replace(config, biped=BipedConfig(fixed_goal=(0.5, 2.0)))
-    np.testing.assert_allclose(draw_goals(moved, 20), np.tile([0.5, 2.0], (20, 1)), atol=1e-6)
-
-
-def test_random_course_under_a_shift_when_asked_for() -> None:
-    config = TrainConfig(task="biped", shift="icy", env=EnvConfig(course="random"))
-    assert len(np.unique(draw_goals(config, 20), axis=0)) == 20
+    ("shift", "course", "fixed"),
+    [("icy", "auto", True), ("none", "fixed", True), ("icy", "random", False),
+     ("none", "auto", False)],
+)  # fmt: skip
+def test_which_course_is_fixed(shift: str, course: Any, fixed: bool) -> None:
+    config = WorldConfig(task="biped", shift=shift, course=course)
+    assert config.make_task().fixed_course == fixed
+    goals = draw_goals(config.options, 20, fixed=fixed)
+    assert len(np.unique(goals, axis=0)) == (1 if fixed else 20)
 
 
 def test_goal_stays_put_and_observation_points_to_it(

@@ -11,13 +11,15 @@ import numpy as np
 import pytest
 
 import twirl_mjx
-from twirl_mjx.config import DroqConfig, EnvConfig, StandConfig, TrainConfig
 from twirl_mjx.sim.dynamics import SHIFTS, make_dynamics
-from twirl_mjx.tasks.registry import TASKS, make
+from twirl_mjx.tasks.registry import TASKS
+from twirl_mjx.tasks.stand import StandOptions
+from twirl_mjx.worlds.config import WorldConfig
+from twirl_mjx.worlds.make import make
 from twirl_mjx.worlds.vector import EnvState
 
 
-@pytest.fixture(params=list(TASKS))
+@pytest.fixture(params=TASKS.names())
 def made(request: pytest.FixtureRequest, worlds: Callable[..., Any]) -> Any:
     return worlds(request.param)
 
@@ -61,7 +63,7 @@ def test_state_is_what_the_contract_says(made: Any, actions: Callable[..., np.nd
         assert not after.invalid.any()
         for values in (after.obs, after.next_obs, after.reward, *after.metrics.values()):
             assert np.isfinite(values).all()
-        assert set(after.metrics) == set(env.task.metric_names)
+        assert set(after.metrics) == set(env.metric_names)
         for value in after.metrics.values():
             assert value.shape == (3,)
             assert value.dtype == jnp.float32
@@ -103,17 +105,15 @@ def test_defaults() -> None:
 
 
 def test_options_reach_the_worlds() -> None:
-    config = TrainConfig(env=EnvConfig(episode_length=7), stand=StandConfig(height_of="front_feet"))
+    config = WorldConfig("stand", StandOptions(height_of="front_feet"), episode_length=7)
     env = make("stand", "icy", 5, shift_strength=0.5, config=config)
     assert env.episode_length == 7
     np.testing.assert_allclose(env.dynamics.friction, [0.7] * 5)
-    assert env.task.name == "stand"
+    assert env.task.options.height_of == "front_feet"
 
 
 def test_a_config_gives_what_is_not_an_argument() -> None:
-    config = TrainConfig(
-        shift="icy", env=EnvConfig(num_envs=4, engine="mjx"), droq=DroqConfig(utd=5)
-    )
+    config = WorldConfig(shift="icy", num_envs=4, engine="mjx")
     env = make("stand", config=config)
     np.testing.assert_allclose(env.dynamics.friction, [0.4] * 4)
     assert type(env.engine).__name__ == "MjxEngine"
@@ -127,8 +127,8 @@ def test_a_config_gives_what_is_not_an_argument() -> None:
     [
         (("bipde",), {}, "unknown task 'bipde'.*nearest: 'biped'"),
         (("stand", "ice"), {}, "unknown shift 'ice'.*nearest: 'icy'"),
-        (("stand", "none", 0), {}, r"env.num_envs = 0 is outside \[1, "),
-        (("stand",), {"engine": "mjc"}, "unknown env.engine 'mjc'.*nearest: 'mjx'"),
+        (("stand", "none", 0), {}, r"num_envs = 0 is outside \[1, "),
+        (("stand",), {"engine": "mjc"}, "unknown engine 'mjc'.*nearest: 'mjx'"),
         (("stand",), {"shift_strength": 3.0}, r"shift_strength = 3.0 is outside \[0.0, 2.0\]"),
     ],
 )

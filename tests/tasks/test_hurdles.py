@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable
 from typing import Any
 
@@ -11,19 +10,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from twirl_mjx.config import HurdlesConfig
-from twirl_mjx.tasks.measures import MEASURES
-from twirl_mjx.training.presets import make_config
 from twirl_mjx.sim import a1
 from twirl_mjx.sim.dynamics import make_dynamics
 from twirl_mjx.sim.scene import build_scene, terrain_height
 from twirl_mjx.tasks import base, rewards
-from twirl_mjx.tasks.hurdles import WEIGHTS, Hurdles, HurdlesState, advance, watch
+from twirl_mjx.tasks.hurdles import WEIGHTS, Hurdles, HurdlesOptions, HurdlesState, advance, watch
 from twirl_mjx.tasks.observations import layout_size, layout_slices
 
 FLAT = build_scene("flat")
 NOMINAL = make_dynamics()
-TASK = Hurdles(make_config("hurdles"))
+TASK = Hurdles()
 POSITIONS = (2.0, 4.0, 6.0)
 SUBSTEPS = 10
 
@@ -122,16 +118,11 @@ def test_the_goal_switches_0_4_m_past_a_hurdle(passed: int, x: float, after: int
     np.testing.assert_allclose(out.goal, [POSITIONS[min(after, 2)], 0.5])
 
 
-CLEAN = judge_with(
-    Hurdles(
-        dataclasses.replace(make_config("hurdles"), hurdles=HurdlesConfig(hurdle_bonus="clean"))
-    )
-)
+CLEAN = judge_with(Hurdles(HurdlesOptions(hurdle_bonus="clean")))
 
 
 def test_count_pays_always_and_event_pays_once() -> None:
-    config = make_config("hurdles")
-    event = dataclasses.replace(config, hurdles=HurdlesConfig(hurdle_bonus="event"))
+    event = HurdlesOptions(hurdle_bonus="event")
     for judge, want in (
         (JUDGE, (0.0, 1.0, 1.0, 2.0)),
         (judge_with(Hurdles(event)), (0, 1, 0, 1)),
@@ -242,16 +233,15 @@ def test_start_draws_a_course() -> None:
     np.testing.assert_array_equal(start.goal[:, 0], start.task.positions[:, 0])
     assert 1.6 * TASK.num_hurdles > 20.0 * 3.3  # more than the A1 can run in an episode
 
-    fixed = Hurdles(dataclasses.replace(make_config("hurdles"), shift="gravity"))
+    fixed = Hurdles(fixed_course=True)
     start = jax.jit(lambda key: fixed.start(key, FLAT, NOMINAL))(keys[0])
     np.testing.assert_allclose(start.task.positions[:3], [2.1, 4.2, 6.3], rtol=1e-5)
 
 
 def test_gaps_in_which_two_hurdles_are_within_reach_are_refused() -> None:
-    config = make_config("hurdles")
-    for options in (HurdlesConfig(min_gap=1.0), HurdlesConfig(min_gap=2.0, max_gap=1.8)):
+    for options in (HurdlesOptions(min_gap=1.0), HurdlesOptions(min_gap=2.0, max_gap=1.8)):
         with pytest.raises(ValueError, match=r"gaps from .* at least 1\.4 m .*nearest"):
-            Hurdles(dataclasses.replace(config, hurdles=options))
+            Hurdles(options)
 
 
 def test_hurdles_stand_on_the_local_ground() -> None:
@@ -276,11 +266,6 @@ def test_bumpy_courses_stay_on_the_terrain() -> None:
     np.testing.assert_allclose(start.goal[:, 1], y)
 
 
-def test_measures_are_metrics_of_the_task() -> None:
-    known = {*TASK.metric_names, "reward", "step", "terminated"}
-    assert {m.signal for m in MEASURES["hurdles"].values()} <= known
-
-
 def test_rewards_of_simulated_worlds(
     worlds: Callable[..., Any], actions: Callable[..., np.ndarray]
 ) -> None:
@@ -291,7 +276,7 @@ def test_rewards_of_simulated_worlds(
         assert not state.invalid.any()
         total = sum(WEIGHTS[name] * state.metrics[name] for name in WEIGHTS)
         np.testing.assert_allclose(state.reward, total, rtol=1e-5)
-        assert set(state.metrics) == set(TASK.metric_names)
+        assert set(state.metrics) == set(made.env.metric_names)
     assert made.traces["step"] == 1
     goal = first.world.goal - first.data.qpos[:, :2]
     np.testing.assert_allclose(first.obs[:, :2], goal, atol=1e-6)

@@ -13,10 +13,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from twirl_mjx.config import ImitateConfig, TrainConfig
 from twirl_mjx.motion.clip import Clip
 from twirl_mjx.motion.formats import write_clip
-from twirl_mjx.training.presets import make_config
 from twirl_mjx.sim import a1
 from twirl_mjx.sim.dynamics import make_dynamics
 from twirl_mjx.sim.scene import CONTROL_DT, build_scene
@@ -26,6 +24,7 @@ from twirl_mjx.tasks.imitate import (
     WEIGHTS,
     Imitate,
     ImitateMemory,
+    ImitateOptions,
     ImitateState,
     count_flights,
 )
@@ -56,15 +55,15 @@ def synthetic_clip(yaw: float = 0.0, **changes: Any) -> Clip:
     return dataclasses.replace(clip, **changes)
 
 
-def config_with(path: Path) -> TrainConfig:
-    return dataclasses.replace(make_config("imitate"), imitate=ImitateConfig(clip=str(path)))
+def options_with(path: Path) -> ImitateOptions:
+    return ImitateOptions(clip=str(path))
 
 
 @pytest.fixture(scope="module")
-def config(tmp_path_factory: pytest.TempPathFactory) -> TrainConfig:
+def options(tmp_path_factory: pytest.TempPathFactory) -> ImitateOptions:
     path = tmp_path_factory.mktemp("clip") / "synthetic.json"
     write_clip(synthetic_clip(), path)
-    return config_with(path)
+    return options_with(path)
 
 
 class Harness:
@@ -104,8 +103,8 @@ class Harness:
 
 
 @pytest.fixture(scope="module")
-def harness(config: TrainConfig) -> Harness:
-    return Harness(Imitate(config))
+def harness(options: ImitateOptions) -> Harness:
+    return Harness(Imitate(options))
 
 
 def test_weights_are_the_papers() -> None:
@@ -220,9 +219,8 @@ def test_episodes_start_anywhere_on_the_reference(harness: Harness) -> None:
     np.testing.assert_allclose(placed, np.maximum(under, 0.0), atol=1e-6)
 
 
-def test_a_share_of_the_episodes_starts_at_rest(config: TrainConfig) -> None:
-    half = dataclasses.replace(config.imitate, standing_fraction=0.5)
-    task = Imitate(dataclasses.replace(config, imitate=half))
+def test_a_share_of_the_episodes_starts_at_rest(options: ImitateOptions) -> None:
+    task = Imitate(dataclasses.replace(options, standing_fraction=0.5))
     keys = jax.random.split(jax.random.key(2), 200)
     start = jax.jit(jax.vmap(lambda key: task.start(key, FLAT, NOMINAL)))(keys)
     rest = np.all(np.asarray(start.qvel) == 0.0, axis=1)
@@ -308,16 +306,16 @@ def test_a_flight_counts_once_and_only_when_long() -> None:
 
 def test_bad_clips_are_refused(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError):
-        Imitate(config_with(tmp_path / "nothing.json"))
+        Imitate(options_with(tmp_path / "nothing.json"))
     path = tmp_path / "once.json"
     write_clip(synthetic_clip(loop="clamp"), path)
     with pytest.raises(ValueError, match=r"once\.json.* 'clamp'.*need 'wrap'"):
-        Imitate(config_with(path))
+        Imitate(options_with(path))
 
 
 def test_the_shipped_leap_is_a_leap() -> None:
     """A perfect tracker of it flies in every cycle and is never ended."""
-    shipped = Harness(Imitate(make_config("imitate")))
+    shipped = Harness(Imitate())
     duration = shipped.observer.duration
     assert int(shipped.observer.cycles(jnp.float32(duration))) == 1
     airborne = []
@@ -341,5 +339,5 @@ def test_rewards_of_simulated_worlds(
         assert not state.invalid.any()
         total = sum(WEIGHTS[name] * state.metrics[name] for name in WEIGHTS)
         np.testing.assert_allclose(state.reward, total, rtol=1e-5)
-        assert set(state.metrics) == set(Imitate.metric_names)
+        assert set(state.metrics) == set(made.env.metric_names)
     assert made.traces["step"] == 1

@@ -25,14 +25,6 @@ def test_height_bonus(height: float, value: float) -> None:
 
 
 @pytest.mark.parametrize(
-    ("cosine", "height", "value"), [(1.0, 0.5, 1.6487213), (0.0, 0.27, 0.5599645), (-1.0, 0.0, 0.0)]
-)
-def test_stand(cosine: float, height: float, value: float) -> None:
-    result = rewards.stand(jnp.float32(cosine), jnp.float32(height))
-    assert float(result) == pytest.approx(value, abs=1e-6)
-
-
-@pytest.mark.parametrize(
     ("z_axis", "displacement", "value"),
     [
         ((-1.0, 0.0, 0.0), (2.0, 0.0), 1.0),  # on the hind legs, belly to the goal

@@ -11,14 +11,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from twirl_mjx.config import StandConfig, TrainConfig
 from twirl_mjx.sim import a1
 from twirl_mjx.sim.dynamics import make_dynamics
 from twirl_mjx.sim.scene import build_scene
 from twirl_mjx.tasks.base import Outcome
-from twirl_mjx.tasks.stand import Stand
+from twirl_mjx.tasks.stand import Stand, StandOptions
 
-FEET = StandConfig(height_of="front_feet", risen_fraction=1.0)
+FEET = StandOptions(height_of="front_feet", risen_fraction=1.0)
 
 
 @pytest.fixture(scope="module")
@@ -75,10 +74,10 @@ def test_reward_by_hand(judge: Callable[..., Outcome]) -> None:
     """Level at 0.5 m, then nose straight up at 0.5 m with hanging front legs."""
     level = np.concatenate([[0, 0, 0.5, 1, 0, 0, 0], a1.DEFAULT_POSE])
     up = np.concatenate([[0, 0, 0.5, 0.5**0.5, 0, -(0.5**0.5), 0], a1.DEFAULT_POSE])
-    root = judge(Stand(TrainConfig(task="stand")), [level, up])
+    root = judge(Stand(), [level, up])
     np.testing.assert_allclose(root.reward, [0.25 + 0.6487213, 1.0 + 0.6487213], atol=1e-5)
     # Front feet: level 0.5 - 0.4 cos 0.9 = 0.251356 m; up: 0.183 m along the nose, the leg level.
-    feet = judge(Stand(TrainConfig(task="stand", stand=FEET)), [level, up])
+    feet = judge(Stand(FEET), [level, up])
     np.testing.assert_allclose(
         feet.reward, [0.25 + np.expm1(0.251356), 1.0 + np.expm1(0.683)], atol=1e-5
     )
@@ -94,7 +93,7 @@ def test_standing_needs_cosine_and_both_front_feet(judge: Callable[..., Outcome]
 
     reach = (-1.047, -0.92)  # the front right leg stretched forwards, which is up
     down = (2.4, -0.92)  # and back, towards the ground of a raised robot
-    task = Stand(TrainConfig(task="stand"))
+    task = Stand()
     outcome = judge(task, [pose(44.3, 0.6), pose(44.6, 0.6), pose(80, 0.6, reach), pose(80, 0.0)])
     np.testing.assert_array_equal(outcome.metrics["standing"], [False, True, True, True])
     lowered = [pose(50, z, down) for z in np.linspace(0.05, 0.6, 12)]
@@ -106,7 +105,7 @@ def test_standing_needs_cosine_and_both_front_feet(judge: Callable[..., Outcome]
 def test_anything_but_a_foot_on_the_ground_ends_the_episode(
     judge: Callable[..., Outcome], poses: dict[str, np.ndarray]
 ) -> None:
-    outcome = judge(Stand(TrainConfig(task="stand")), list(poses.values()))
+    outcome = judge(Stand(), list(poses.values()))
     fallen = dict(zip(poses, outcome.terminated.tolist(), strict=True))
     assert fallen == {
         "on four feet": False,
@@ -124,12 +123,12 @@ def test_a_millimetre_off_the_ground_is_no_fall(
     judge: Callable[..., Outcome], poses: dict[str, np.ndarray]
 ) -> None:
     raised = [pose + np.eye(19)[2] * 0.005 for pose in poses.values()]
-    assert not judge(Stand(TrainConfig(task="stand")), raised).terminated.any()
+    assert not judge(Stand(), raised).terminated.any()
 
 
-def draw_starts(config: StandConfig, count: int) -> np.ndarray:
+def draw_starts(config: StandOptions, count: int) -> np.ndarray:
     """Return qpos [count, 19] of as many episode starts."""
-    task, scene = Stand(TrainConfig(task="stand", stand=config)), build_scene("flat")
+    task, scene = Stand(config), build_scene("flat")
     keys = jax.random.split(jax.random.key(1), count)
     start = jax.jit(jax.vmap(lambda key: task.start(key, scene, make_dynamics()).qpos))
     return np.asarray(start(keys), np.float64)
@@ -154,7 +153,7 @@ def lowest(model: mujoco.MjModel, qpos: np.ndarray) -> tuple[str, float]:
 
 def test_starts_on_four_feet(model: mujoco.MjModel) -> None:
     """joint_pos = default + U(-0.05, 0.05), level, the lowest foot just on the ground."""
-    qpos = draw_starts(StandConfig(), 500)
+    qpos = draw_starts(StandOptions(), 500)
     np.testing.assert_array_equal(qpos[:, :2], 0.0)
     np.testing.assert_array_equal(qpos[:, 3:7], np.tile([1.0, 0, 0, 0], (500, 1)))
     noise = qpos[:, 7:] - a1.DEFAULT_POSE
@@ -168,7 +167,7 @@ def test_starts_on_four_feet(model: mujoco.MjModel) -> None:
 
 def test_risen_starts(model: mujoco.MjModel) -> None:
     """Pitch U(0, 83 deg), on the hind feet alone, within the joint limits, not fallen."""
-    qpos = draw_starts(StandConfig(risen_fraction=1.0), 500)
+    qpos = draw_starts(StandOptions(risen_fraction=1.0), 500)
     pitch = pitches(qpos)
     assert 0.0 <= pitch.min() < 2.0
     assert 81.0 < pitch.max() <= 83.01
@@ -183,7 +182,7 @@ def test_risen_starts(model: mujoco.MjModel) -> None:
 
 
 def test_share_of_risen_starts() -> None:
-    pitch = pitches(draw_starts(StandConfig(risen_fraction=0.25), 500))
+    pitch = pitches(draw_starts(StandOptions(risen_fraction=0.25), 500))
     risen = pitch > 1e-3
     assert risen.mean() == pytest.approx(0.25, abs=0.06)
     np.testing.assert_allclose(pitch[~risen], 0.0, atol=1e-6)

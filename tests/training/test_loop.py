@@ -15,12 +15,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from twirl_mjx.training.config import TrainConfig
 from twirl_mjx.droq import learner as droq
 from twirl_mjx.policies.learned import load_policy
 from twirl_mjx.replay import ring
 from twirl_mjx.training import guards, loop, rundir, state
 from twirl_mjx.training.checkpoint import Checkpoints, load_learner, load_replay
+from twirl_mjx.training.config import TrainConfig
 from twirl_mjx.training.state import TrainState
 
 
@@ -201,7 +201,7 @@ def test_stop_event_saves_and_ends_the_loop(
 
 
 def test_epoch_is_traced_once_and_donates(stand_config: TrainConfig) -> None:
-    env = loop.make_env(stand_config, training=True)
+    env = loop.make_env(stand_config)
     traces = 0
     observe = env.task.observer.observe
 
@@ -244,7 +244,7 @@ def test_source_data_are_required(stand_config: TrainConfig, tmp_path: Path) -> 
 
 
 def test_non_finite_world_never_reaches_the_ring(stand_config: TrainConfig) -> None:
-    env = loop.make_env(stand_config, training=True)
+    env = loop.make_env(stand_config)
     train_state = state.init(stand_config, env, jax.random.key(0), None)
     data = train_state.env.data
     poisoned = data.replace(qvel=data.qvel.at[1, 0].set(jnp.nan))

@@ -13,17 +13,18 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from twirl_mjx.training.config import TrainConfig
 from twirl_mjx.deploy.export import export_onnx
 from twirl_mjx.droq import learner as droq
 from twirl_mjx.policies.learned import load_policy
-from twirl_mjx.policies.resolve import resolve_policy
-from twirl_mjx.training.presets import make_config
+from twirl_mjx.policies.resolve import Source, resolve_policy
 from twirl_mjx.replay import dataset
-from twirl_mjx.worlds.make import make_env
 from twirl_mjx.training import pipeline, rundir, weights
 from twirl_mjx.training.checkpoint import load_learner, load_replay
+from twirl_mjx.training.config import TrainConfig
+from twirl_mjx.training.presets import make_config
+from twirl_mjx.training.rundir import RunDir
 from twirl_mjx.training.source import collect
+from twirl_mjx.worlds.make import make_env
 
 
 @pytest.fixture(scope="module")
@@ -58,8 +59,7 @@ def test_collected_data_are_used_again_until_settings_change(
     said: list[str] = []
     config = dataclasses.replace(biped, source="trot")
     source = pipeline.find_source(config, "debug", runs, said.append)
-    run_dir = runs / "biped-twirl-debug-s0"
-    pipeline.source_data(config, run_dir, source, said.append)
+    pipeline.source_data(config, RunDir(runs / "biped-twirl-debug-s0"), source, said.append)
     assert any("source.npz" in line for line in said)
     assert not any("collecting" in line for line in said)
     other = dataclasses.replace(source, digest="another policy")
@@ -74,13 +74,13 @@ def test_adaptation_starts_from_the_nominal_run(
     said: list[str] = []
     config = dataclasses.replace(biped, shift="icy", variant=variant)  # type: ignore[arg-type]
     run_dir = pipeline.run(config, "debug", runs, None, said.append)
-    with (run_dir / "eval.csv").open(newline="") as file:
+    with run_dir.episodes.open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert {row["shift"] for row in rows} == {"icy"}
     assert {row["variant"] for row in rows} == {variant}
     replayed = any("the replay of" in line for line in said)
     assert replayed == (variant in ("twirl", "twirl+weights"))
-    assert not (run_dir / "source.npz").exists(), "adaptation collects nothing"
+    assert not run_dir.dataset.exists(), "adaptation collects nothing"
 
 
 def test_source_networks_are_taken_over(biped: TrainConfig, runs: Path) -> None:
@@ -123,7 +123,7 @@ def test_weights_refuse_sources_that_do_not_fit(biped: TrainConfig, runs: Path) 
 
 
 def test_replay_of_the_nominal_run_is_the_source(runs: Path) -> None:
-    rows = load_replay(runs / "biped-twirl-debug-s0")
+    rows = load_replay(runs / "biped-twirl-debug-s0", capacity=1000)
     assert rows.shape == (64, 2 * 101 + 12 + 2)
     assert np.isfinite(rows).all()
 
@@ -133,7 +133,7 @@ def test_onnx_source_acts_like_the_policy_it_came_from(
 ) -> None:
     run_dir = runs / "biped-twirl-debug-s0"
     onnx = export_onnx(run_dir, tmp_path / "policy.onnx")
-    env = make_env(biped, num_envs=2)
+    env = make_env(biped.evaluation, num_envs=2)
     key = jax.random.key(4)
     learned, _ = collect(env, resolve_policy(str(run_dir), biped).policy, key, 12)
     hosted, _ = collect(env, resolve_policy(str(onnx), biped).policy, key, 12)
@@ -162,7 +162,7 @@ def test_a_finished_run_is_left_as_it_is(biped: TrainConfig, runs: Path) -> None
     before = {path: path.read_bytes() for path in run_dir.iterdir() if path.is_file()}
     said: list[str] = []
     shorter = dataclasses.replace(biped, source="trot", total_env_steps=32)
-    assert pipeline.run(shorter, "debug", runs, None, said.append) == run_dir
+    assert pipeline.run(shorter, "debug", runs, None, said.append).path == run_dir
     assert f"{run_dir} is finished" in said
     after = {path: path.read_bytes() for path in run_dir.iterdir() if path.is_file()}
     assert before == after
@@ -174,11 +174,11 @@ def test_weights_act_and_are_measured_from_the_first_step(biped: TrainConfig, ru
         biped, variant="weights", source=str(path), warmup_env_steps=64, total_env_steps=32
     )
     run_dir = pipeline.run(config, "debug", runs, "warm", print)
-    with (run_dir / "metrics.csv").open(newline="") as file:
+    with run_dir.metrics.open(newline="") as file:
         first = [row for row in csv.DictReader(file) if row["env_steps"] == "0"]
     assert "eval/return" in {row["metric"] for row in first}
     # Nothing was learned before the end of the warm-up: the actions are the source's, with noise.
-    taken = load_replay(run_dir)
+    taken = load_replay(run_dir.path, capacity=1000)
     obs, action = taken[:, :101], taken[:, 101:113]
     mean = load_policy(path).act(obs)
     draws = np.random.default_rng(0).uniform(-1.0, 1.0, (200, *action.shape))
@@ -197,7 +197,7 @@ def test_what_needs_no_source_is_refused_before_one_is_sought(
     other = dataclasses.replace(trot, droq=dataclasses.replace(biped.droq, tau=0.1))
     with pytest.raises(rundir.RunMismatchError, match="tau"):
         pipeline.run(other, "debug", runs, None, print)
-    monkeypatch.setattr(rundir, "owner", lambda run_dir: "process 1 on mars")
+    monkeypatch.setattr(RunDir, "owner", lambda run_dir: "process 1 on mars")
     with pytest.raises(rundir.RunBusyError, match="in use by process 1 on mars"):
         pipeline.run(trot, "debug", runs, None, print)
 
@@ -215,7 +215,7 @@ def test_a_name_leads_nowhere_else(
 
 def test_gaps_are_checked_before_a_source_is_trained(tmp_path: Path) -> None:
     config = make_config("hurdles", "debug")
-    narrow = dataclasses.replace(config, hurdles=dataclasses.replace(config.hurdles, min_gap=0.5))
+    narrow = dataclasses.replace(config, options=dataclasses.replace(config.options, min_gap=0.5))
     with pytest.raises(ValueError, match=r"gaps from 0.5 to 2.6 m: .*nearest"):
         pipeline.run(narrow, "debug", tmp_path, None, print)
     assert list(tmp_path.iterdir()) == []
@@ -249,11 +249,14 @@ def test_a_refused_run_leaves_its_name_free(biped: TrainConfig, runs: Path, tmp_
         pipeline.run(config, "debug", tmp_path, "name", print)
     assert list(tmp_path.iterdir()) == []
     # Killed before any work was done: only the description of the run is there.
-    rundir.open_run(tmp_path / "name", config)
-    rundir.open_run(tmp_path / "name", biped)
-    (tmp_path / "name" / "metrics.csv").touch()
-    with pytest.raises(rundir.RunMismatchError, match="num_critics: 2 -> 3"):
-        rundir.open_run(tmp_path / "name", config)
+    run_dir = RunDir(tmp_path / "name")
+    run_dir.open(config)
+    assert run_dir.status(biped) == rundir.New()
+    run_dir.open(biped)
+    run_dir.metrics.touch()
+    status = run_dir.status(config)
+    assert isinstance(status, rundir.Foreign)
+    assert "num_critics: 2 -> 3" in str(status.error)
 
 
 def test_a_nominal_run_of_another_preset_is_not_taken(biped: TrainConfig, runs: Path) -> None:
@@ -272,18 +275,18 @@ def test_source_data_hold_whole_episodes(
         return collect(env, policy, key, size)
 
     monkeypatch.setattr(pipeline, "collect", few)
-    crowd = dataclasses.replace(biped, env=dataclasses.replace(biped.env, num_envs=64))
+    crowd = dataclasses.replace(biped, num_envs=64)
     config = dataclasses.replace(crowd, source="trot")
     source = pipeline.find_source(config, "debug", runs, print)
     pipeline.write_dataset(config, source, tmp_path / "source.npz", "digest", print)
-    assert worlds == [biped.replay.source_size // biped.env.episode_length]
+    assert worlds == [biped.replay.source_size // biped.eval.episode_length]
 
 
 def test_the_engine_does_not_decide_what_is_collected(biped: TrainConfig, runs: Path) -> None:
     config = dataclasses.replace(biped, source="trot")
     source = pipeline.find_source(config, "debug", runs, print)
     digest = pipeline.collection_digest(config, source)
-    mjx = dataclasses.replace(config, env=dataclasses.replace(config.env, engine="mjx"))
+    mjx = dataclasses.replace(config, engine="mjx")
     assert pipeline.collection_digest(mjx, source) == digest
     quiet = dataclasses.replace(config.replay, source_noise=False)
     calm = dataclasses.replace(config, replay=quiet)
@@ -312,11 +315,11 @@ def test_a_learned_source_is_noisy_only_while_its_data_are_collected(
 
 
 def test_the_replay_of_another_task_is_no_source_data(biped: TrainConfig, tmp_path: Path) -> None:
-    rundir.open_run(tmp_path, make_config("stand", "debug"))
-    source = pipeline.Source(None, "a stand run", "digest", None, tmp_path)  # type: ignore[arg-type]
+    RunDir(tmp_path).open(make_config("stand", "debug"))
+    source = Source(None, "a stand run", "digest", run_dir=tmp_path)  # type: ignore[arg-type]
     config = dataclasses.replace(biped, shift="icy")
     with pytest.raises(ValueError, match="is a run of task stand: its replay is no experience"):
-        pipeline.source_data(config, tmp_path, source, print)
+        pipeline.source_data(config, RunDir(tmp_path), source, print)
 
 
 def test_weights_that_cannot_fit_are_refused_before_any_stage(

@@ -11,16 +11,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from twirl_mjx.training.config import TrainConfig
 from twirl_mjx.droq import learner as droq
 from twirl_mjx.policies.learned import load_policy
-from twirl_mjx.training.presets import make_config
 from twirl_mjx.replay import ring
-from twirl_mjx.worlds.make import make_env
-from twirl_mjx.worlds.vector import VectorEnv
 from twirl_mjx.training import loop, seeds, state
+from twirl_mjx.training.config import TrainConfig
+from twirl_mjx.training.presets import make_config
 from twirl_mjx.training.state import TrainState
 from twirl_mjx.types import Metrics
+from twirl_mjx.worlds.make import make_env
+from twirl_mjx.worlds.vector import VectorEnv
 
 SEEDS = [3, 5]
 
@@ -40,7 +40,7 @@ def to_host(tree: TrainState) -> TrainState:
 
 @pytest.fixture(scope="module")
 def env(stand_config: TrainConfig) -> VectorEnv:
-    return make_env(stand_config, training=True, threads=1)
+    return make_env(stand_config, threads=1)
 
 
 @pytest.fixture(scope="module")
@@ -136,7 +136,7 @@ def test_one_seed_can_be_saved(
 def test_source_ring_is_shared_not_copied() -> None:
     """Shapes only; a batch with a source keeps one source ring and one counter of transitions."""
     config = make_config("biped", "debug")
-    env = make_env(config, training=True, threads=1)
+    env = make_env(config, threads=1)
     data = ring.init(64, env.observation_size, env.action_size)
     source = data.replace(size=jnp.int32(64))
 

@@ -13,11 +13,11 @@ import textwrap
 import jax
 import pytest
 
+from twirl_mjx.training import seeds, sharding, state
 from twirl_mjx.training.config import TrainConfig
+from twirl_mjx.training.state import TrainState
 from twirl_mjx.worlds.make import make_env
 from twirl_mjx.worlds.vector import VectorEnv
-from twirl_mjx.training import seeds, sharding, state
-from twirl_mjx.training.state import TrainState
 
 CHILD = """
     import dataclasses
@@ -33,12 +33,12 @@ CHILD = """
     base = make_config("stand", "debug")
     config = dataclasses.replace(  # epochs of two vector steps, updates after the first of all
         base,
-        env=dataclasses.replace(base.env, engine="ENGINE", num_envs=4),
+        engine="ENGINE", num_envs=4,
         droq=dataclasses.replace(base.droq, hidden_sizes=(32,)),
         warmup_env_steps=4,
         epoch_env_steps=8,
     )
-    env = make_env(config, training=True, threads=1)
+    env = make_env(config, threads=1)
 
     def single():
         init = jax.jit(lambda key: state.init(config, env, key, None))
@@ -122,7 +122,7 @@ def run_child(body: str, engine: str, error: float) -> None:
 
 @pytest.fixture(scope="module")
 def env(stand_config: TrainConfig) -> VectorEnv:
-    return make_env(stand_config, training=True, threads=1)
+    return make_env(stand_config, threads=1)
 
 
 def test_epochs_keep_the_shapes_of_their_state(stand_config: TrainConfig, env: VectorEnv) -> None:

@@ -17,7 +17,7 @@ from twirl_mjx.commands.console import parse
 from twirl_mjx.plugins import is_reference
 from twirl_mjx.tasks.registry import TASKS
 from twirl_mjx.training.config import TrainConfig
-from twirl_mjx.training.presets import make_config
+from twirl_mjx.training.presets import default_preset, make_config
 from twirl_mjx.worlds.config import WorldConfig
 
 
@@ -35,13 +35,6 @@ class TrainOptions:
     runs: Path
     """Folder of all runs."""
     config: Annotated[TrainConfig, tyro.conf.arg(name="")]
-
-
-def default_preset() -> str:
-    """Return ``paper`` where jax has an accelerator, else ``cpu``."""
-    import jax
-
-    return "cpu" if jax.default_backend() == "cpu" else "paper"
 
 
 def parse_train(argv: list[str], prog: str = "twirl train") -> TrainOptions:

@@ -134,11 +134,11 @@ class Task[O]:
 
     @classmethod
     def paper_options(cls) -> O:
-        """Return the options of the paper's preset, which its policies were trained with."""
+        """Return the options of the paper's preset, as evaluation uses them."""
         prefix = f"{cls.name}."
         settings = cls.presets.get("paper", {})
         own = {k.removeprefix(prefix): v for k, v in settings.items() if k.startswith(prefix)}
-        return cls.Options(**own)
+        return cls.evaluation_options(cls.Options(**own))
 
     @classmethod
     def evaluation_options(cls, options: O) -> O:

@@ -48,6 +48,13 @@ SETTINGS: dict[str, Mapping[str, Any]] = {
 PRESETS = tuple(SETTINGS)
 
 
+def default_preset() -> str:
+    """Return ``paper`` where jax has an accelerator, else ``cpu``."""
+    import jax
+
+    return "cpu" if jax.default_backend() == "cpu" else "paper"
+
+
 def make_config(task: str, preset: str = "paper") -> TrainConfig:
     """Return the config of a task under a preset.
 

@@ -30,18 +30,20 @@ def check_weights_fit(config: TrainConfig, preset: str) -> None:
         case AtPath(is_shipped=True) | RunOf():
             task = source_task_of(config)
             layout = TASKS.get(task)(config.source_options).observer.layout
-            check_layouts(config, layout, f"the source task {task}")
+            check_layouts(config, task, layout, f"the source task {task}")
 
 
-def check_layouts(config: TrainConfig, layout: tuple[Entry, ...], origin: str) -> None:
-    """Check that a policy that observes ``layout`` observes what ``config.task`` shows.
+def check_layouts(
+    config: TrainConfig, task: str, layout: tuple[Entry, ...], origin: str
+) -> None:
+    """Check that a policy of ``task`` that observes ``layout`` observes what ``config.task`` shows.
 
     Raises:
         ValueError: It does not; the message names ``origin``.
     """
     if layout != config.make_task().observer.layout:
         raise ValueError(
-            f"{origin} observes something else than {config.task} shows:"
+            f"{origin} observes as task {task}, not as {config.task}:"
             " its weights do not fit (nearest variant: 'twirl')"
         )
 
@@ -61,7 +63,7 @@ def source_weights(
     if not isinstance(policy, NumpyPolicy):
         raise ValueError(f"{source.origin} has no network weights (nearest variant: 'twirl')")
     own = config_of_source(config, policy.header, source.origin)
-    check_layouts(config, own.make_task().observer.layout, source.origin)
+    check_layouts(config, own.task, own.make_task().observer.layout, source.origin)
     sizes = tuple(
         len(policy.actor_params[name]["bias"]) for name in hidden_layers(policy.actor_params)
     )

@@ -13,7 +13,7 @@ from twirl_mjx.sim.scene import SimOptions, build_scene
 from twirl_mjx.tasks.registry import TASKS
 from twirl_mjx.tasks.task import Task
 from twirl_mjx.worlds.check import check_task
-from twirl_mjx.worlds.config import WorldConfig
+from twirl_mjx.worlds.config import WorldConfig, world_fields
 from twirl_mjx.worlds.vector import VectorEnv
 
 
@@ -87,8 +87,10 @@ def make(
         options = task.options if options is None else options
     kind = task if isinstance(task, type) else type(task)
     name = task if isinstance(task, str) else TASKS.register(kind).name
-    base = config or WorldConfig(task=name, num_envs=256)
     name = TASKS.admit(name)
+    base = WorldConfig(task=name, num_envs=256)
+    if config is not None:
+        base = WorldConfig(**world_fields(config))
     if options is None and name == base.task:
         options = base.options
     elif isinstance(options, Mapping):

@@ -15,11 +15,11 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import check_env
 
-from twirl_mjx.config import EnvConfig, TrainConfig
 from twirl_mjx.worlds.adapters import GymnasiumEnv, to_brax, to_gymnasium
+from twirl_mjx.worlds.config import WorldConfig
 
 LIMIT = 4
-CONFIG = TrainConfig(env=EnvConfig(episode_length=LIMIT))
+CONFIG = WorldConfig(episode_length=LIMIT)
 
 
 @pytest.fixture(scope="module")
@@ -39,7 +39,7 @@ def test_check_env(gym: GymnasiumEnv) -> None:
 def test_episode_ends_at_the_limit_with_its_last_observation(gym: GymnasiumEnv) -> None:
     obs, info = gym.reset(seed=3)
     assert obs.dtype == np.float32
-    assert set(info) == {"invalid", *gym.env.task.metric_names}
+    assert set(info) == {"invalid", *gym.env.metric_names}
     for step in range(1, LIMIT + 1):
         obs, reward, terminated, truncated, info = gym.step(np.full(12, 0.1, np.float32))
         assert (terminated, truncated) == (False, step == LIMIT)

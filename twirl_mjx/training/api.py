@@ -1,0 +1,99 @@
+"""Training from Python: one call, and what came out of it."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import functools
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from twirl_mjx.policies.learned import load_policy
+from twirl_mjx.policies.resolve import Source
+from twirl_mjx.tasks.registry import TASKS
+from twirl_mjx.tasks.task import Task
+from twirl_mjx.training import pipeline
+from twirl_mjx.training.config import TrainConfig
+from twirl_mjx.training.config_json import settle
+from twirl_mjx.training.presets import default_preset, make_config
+from twirl_mjx.training.rundir import RunDir
+from twirl_mjx.types import Policy, SourcePolicy
+
+
+@dataclasses.dataclass(frozen=True)
+class RunResult:
+    """A finished run."""
+
+    directory: Path
+    """Where everything of it lies."""
+    config: TrainConfig
+    """Every setting."""
+    measures: dict[str, float]
+    """Means over the closing episodes on fresh seeds."""
+
+    @property
+    def policy(self) -> Policy:
+        """The best policy by evaluation return: ``act(obs [..., O]) -> action [..., A]``, numpy."""
+        return load_policy(RunDir(self.directory).policy)
+
+    @functools.cached_property
+    def curves(self) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+        """Metric -> (transitions [n], values [n]) over the run."""
+        found: dict[str, list[tuple[float, float]]] = {}
+        with RunDir(self.directory).metrics.open(newline="") as file:
+            for row in csv.DictReader(file):
+                point = (float(row["env_steps"]), float(row["value"]))
+                found.setdefault(row["metric"], []).append(point)
+        columns = {name: np.array(points).T for name, points in found.items()}
+        return {name: (steps, values) for name, (steps, values) in columns.items()}
+
+
+def train(
+    task: str | type[Task],
+    *,
+    preset: str | None = None,
+    source: str | SourcePolicy | None = None,
+    name: str | None = None,
+    runs: Path | str = "runs",
+    say: Callable[[str], None] = print,
+    **settings: Any,
+) -> RunResult:
+    """Train a task to its budget, with every stage before it that is missing; resumes.
+
+    Args:
+        task: Name, ``file.py:Name``, or a task class of your own.
+        preset: ``paper``, ``cpu`` or ``debug``; ``cpu`` without an accelerator, else ``paper``.
+        source: A policy object (``types.SourcePolicy``), or what ``--source`` takes.
+        name: Name of the run; derived from task, variant, preset and seed by default.
+        runs: Folder of all runs.
+        say: Prints one line for a person.
+        **settings: Settings of the run by name (``seed=1``, ``shift="icy"``,
+            ``total_env_steps=50_000``); those of a part as a mapping (``droq={"utd": 1.0}``,
+            ``biped={"distance_weight": 4.0}``).
+
+    Raises:
+        ValueError: An unknown name or a value out of range, with the nearest valid choice.
+        StoppedError: A signal stopped it after saving; the same call resumes.
+    """
+    registered = task if isinstance(task, str) else TASKS.register(task).name
+    preset = preset or default_preset()
+    flat: dict[str, Any] = {}
+    for key, value in settings.items():
+        if isinstance(value, Mapping):
+            flat |= {f"{key}.{inner}": v for inner, v in value.items()}
+        else:
+            flat[key] = value
+    given = None
+    if isinstance(source, str):
+        flat["source"] = source
+    elif source is not None:
+        kind = type(source)
+        given = Source(source, f"object {kind.__qualname__}", f"{kind.__module__}.{kind.__name__}")
+    config = settle(make_config(registered, preset), flat)
+    run_dir = pipeline.run(config, preset, Path(runs), name, say, given)
+    done = run_dir.finished()
+    assert done is not None, "pipeline.run returns finished runs"
+    return RunResult(run_dir.path, config, done.measures)
