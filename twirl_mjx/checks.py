@@ -3,6 +3,22 @@
 from __future__ import annotations
 
 import difflib
+from collections.abc import Iterable
+
+
+def nearest(value: object, choices: Iterable[object]) -> str:
+    """Return the one of ``choices`` (at least one) whose name is closest to ``value``."""
+    names = {str(name).casefold(): str(name) for name in choices}
+    close = difflib.get_close_matches(str(value).casefold(), names, n=1, cutoff=0.0)
+    return names[close[0]] if close else next(iter(names.values()))
+
+
+def choose_one(value: object, choices: Iterable[object]) -> str:
+    """Return "choose one of a, b (nearest: 'a')", the end of a refusal of ``value``."""
+    names = [str(name) for name in choices]
+    if not names:
+        return "there is none to choose"
+    return f"choose one of {', '.join(names)} (nearest: {nearest(value, names)!r})"
 
 
 def check_choice(what: str, value: str, choices: tuple[str, ...]) -> None:
@@ -12,10 +28,7 @@ def check_choice(what: str, value: str, choices: tuple[str, ...]) -> None:
         ValueError: The message lists the choices and the nearest one.
     """
     if value not in choices:
-        nearest = (difflib.get_close_matches(value, choices, n=1, cutoff=0.0) or choices[:1])[0]
-        raise ValueError(
-            f"unknown {what} {value!r}: choose one of {', '.join(choices)} (nearest: {nearest!r})"
-        )
+        raise ValueError(f"unknown {what} {value!r}: {choose_one(value, choices)}")
 
 
 def check_range(what: str, value: float, low: float, high: float) -> None:
@@ -25,8 +38,8 @@ def check_range(what: str, value: float, low: float, high: float) -> None:
         ValueError: The message names the value, the range and the nearest end.
     """
     if not low <= value <= high:
-        nearest = low if not value > low else high
-        raise ValueError(f"{what} = {value} is outside [{low}, {high}] (nearest: {nearest})")
+        end = low if not value > low else high
+        raise ValueError(f"{what} = {value} is outside [{low}, {high}] (nearest: {end})")
 
 
 def check_updates(utd: float, num_envs: int, updates_per_block: int) -> None:

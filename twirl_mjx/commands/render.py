@@ -54,6 +54,7 @@ class RenderOptions:
         """
         check_range("seconds", self.seconds, *FILM_SECONDS)
         check_range("panels", self.panels, 1, MAX_PANELS)
+        check_range("seed", self.seed, 0, 2**32 - 1)
         if self.shift is not None:
             check_choice("shift", self.shift, SHIFTS)
 
@@ -86,7 +87,6 @@ def film(config: TrainConfig, options: RenderOptions, stem: Path) -> Path:
     found = resolve_policy(options.policy, config)
     steps = min(config.env.episode_length, round(options.seconds / CONTROL_DT))
     recording = record_episode(config, found.policy, seed=options.seed, steps=steps)
-    stem.parent.mkdir(parents=True, exist_ok=True)
     video, strip = render_episode(
         scene_model(config, recording),
         recording.qpos,

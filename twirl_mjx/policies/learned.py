@@ -8,15 +8,14 @@ loading imports neither jax nor a simulator, so a file runs on a robot's compute
 from __future__ import annotations
 
 import dataclasses
-import io
 import json
-import zipfile
-import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+
+from twirl_mjx import files
 
 if TYPE_CHECKING:
     from twirl_mjx.policies.onnx_file import OnnxPolicy
@@ -25,6 +24,8 @@ FORMAT = "twirl_mjx policy"
 FORMAT_VERSION = 1
 BEST_POLICY = "policy.npz"
 LAST_POLICY = "policy_last.npz"
+LIMIT = 1 << 30
+"""Bytes, largest policy that is read; the paper's networks have half a million."""
 
 Params = dict[str, dict[str, np.ndarray]]
 """Actor parameters: layer name to ``kernel`` [in, out] and ``bias`` [out]."""
@@ -254,25 +255,16 @@ def save_policy(
     params = _as_params(actor_params)
     check_params(params, header.observation_size, header.action_size)
     arrays = {f"{la}/{n}": v for la, values in params.items() for n, v in sorted(values.items())}
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(path.name + ".partial")
-    with partial.open("wb") as file:
-        np.savez_compressed(file, allow_pickle=False, header=np.array(header.to_json()), **arrays)
-    partial.replace(path)
+    files.write_npz(path, {"header": np.array(header.to_json())} | arrays, compressed=True)
     return path
 
 
 def _read_npz(path: Path) -> NumpyPolicy:
     """Read one policy file; every failure becomes a ``PolicyFileError`` with the reason."""
     try:
-        archive = np.load(io.BytesIO(path.read_bytes()), allow_pickle=False)
-        if isinstance(archive, np.ndarray):
-            raise PolicyFileError(f"{path} holds one array, not a policy archive")
-        arrays = {name: archive[name] for name in archive.files}
-    except PolicyFileError:
-        raise
-    except (zipfile.BadZipFile, zlib.error, EOFError, OSError, ValueError, KeyError) as error:
-        raise PolicyFileError(f"{path} is not a readable .npz archive: {error}") from error
+        arrays = files.read_npz(path, "a policy", LIMIT)
+    except files.FileError as error:
+        raise PolicyFileError(str(error)) from error
     text = arrays.pop("header", None)
     if text is None or text.dtype.kind != "U":
         raise PolicyFileError(f"{path} is not a policy: no header among {sorted(arrays)[:8]}")
@@ -296,7 +288,7 @@ def resolve_policy_path(path: str | Path) -> Path:
         FileNotFoundError: nothing to load there; the message lists what is and how to make it.
     """
     path = Path(path)
-    if path.is_file():
+    if path.exists() and not path.is_dir():
         return path
     if not path.exists():
         raise FileNotFoundError(

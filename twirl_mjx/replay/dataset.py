@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import zipfile
-import zlib
 from pathlib import Path
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 
+from twirl_mjx import files
 from twirl_mjx.types import Transition
 
 FORMAT = "twirl-source-dataset"
@@ -55,13 +54,9 @@ def write(path: Path, header: DatasetHeader, data: Transition) -> None:
         header: Its description.
         data: Transitions [n, ...] as arrays.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(path.name + ".partial")
     text = json.dumps(dataclasses.asdict(header), sort_keys=True)
     arrays: dict[str, Any] = {name: np.asarray(getattr(data, name)) for name in FIELDS}
-    with partial.open("wb") as file:
-        np.savez(file, allow_pickle=False, header=np.array(text), **arrays)
-    partial.replace(path)
+    files.write_npz(path, {"header": np.array(text)} | arrays)
 
 
 def read(
@@ -73,7 +68,7 @@ def read(
         FileNotFoundError: No such file.
         DatasetError: Unreadable, of another version or task, of wrong sizes, or not finite.
     """
-    if not path.is_file():
+    if not path.exists():
         raise FileNotFoundError(f"no source dataset at {path}; `twirl collect` makes one")
     header, arrays = _load(path)
     for what, found, need in (
@@ -104,15 +99,11 @@ def read(
 
 def _load(path: Path) -> tuple[DatasetHeader, dict[str, np.ndarray]]:
     try:
-        with path.open("rb") as file:
-            archive = np.load(file, allow_pickle=False)
-            if isinstance(archive, np.ndarray):
-                raise ValueError("it holds one array, not an archive")
-            arrays = {name: archive[name] for name in archive.files}
+        arrays = files.read_npz(path, "a source dataset")
         record = json.loads(str(arrays.pop("header")))
         if not isinstance(record, dict):
             raise ValueError(f"its header is {record!r}, not a JSON object")
-    except (zipfile.BadZipFile, zlib.error, EOFError, OSError, ValueError, KeyError) as error:
+    except (ValueError, KeyError, RecursionError) as error:
         raise DatasetError(
             f"{path} is not a readable source dataset: {error}; remove it and collect again"
         ) from error

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import contextlib
-import csv
 import dataclasses
 import statistics
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+from twirl_mjx import files
 from twirl_mjx.config import TrainConfig
 from twirl_mjx.sweep.plan import METRICS_CSV, Cell, reached_steps
 from twirl_mjx.training import rundir
@@ -62,16 +61,10 @@ def measure(runs: Path) -> list[Speed]:
 def _rates(path: Path) -> tuple[float, float] | None:
     """Return the median transitions and updates per second of the whole rows of a run."""
     values: dict[str, list[float]] = {"env_steps_per_s": [], "updates_per_s": []}
-    with path.open(newline="") as file:
-        rows = csv.reader(line for line in file if line.endswith("\n"))
-        header = next(rows, [])
-        for cells in rows:
-            if len(cells) != len(header):
-                continue  # cut off by a kill, or being written
-            row = dict(zip(header, cells, strict=True))
-            if row.get("metric") in values and row["grad_steps"] not in ("", "0"):
-                with contextlib.suppress(ValueError):
-                    values[row["metric"]].append(float(row["value"]))
+    cells = {"metric": str, "grad_steps": int, "value": float}
+    for row in files.read_rows(path, "the metrics of a run", cells, growing=True):
+        if row["metric"] in values and row["grad_steps"]:
+            values[row["metric"]].append(row["value"])
     medians = [statistics.median(v) if v else 0.0 for v in values.values()]
     return (medians[0], medians[1]) if min(medians) > 0.0 else None
 

@@ -6,11 +6,10 @@ with comment lines that say what was reduced and which command makes the rows ag
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Sequence
 from pathlib import Path
 
+from twirl_mjx import files
 from twirl_mjx.figures.style import METRICS
 from twirl_mjx.figures.tables import CURVE_COLUMNS, EPISODE_COLUMNS
 from twirl_mjx.sweep.grid import Grid
@@ -82,7 +81,7 @@ def stale_tables(folder: Path, grid: Grid, arms: set[str]) -> list[Path]:
     mark = f"# grid: {grid.results_name}"
     stale = []
     for path in sorted(folder.glob("*.csv")):
-        notes = path.read_text(encoding="utf-8")[:2000].splitlines()
+        notes = files.read_text(path, "a result table")[:2000].splitlines()
         arm = path.name.removesuffix(".csv").removesuffix(".episodes")
         if mark in notes and (arm not in arms or not expected.issubset(notes)):
             stale.append(path)
@@ -95,11 +94,10 @@ def curve_rows(cell: Cell, runs: Path, columns: Sequence[str]) -> list[Row]:
     if cell.config.variant == "zero-shot" or not path.is_file():
         return _untrained_rows(cell, runs, columns)
     series: dict[str, list[Row]] = {}
-    with path.open(newline="") as file:
-        for row in csv.DictReader(file):
-            name = row["metric"]
-            if name.removeprefix(EVALUATION) in METRICS:
-                series.setdefault(name, []).append(row | _settings(cell, columns))
+    for row in files.read_rows(path, "the metrics of a run", dict.fromkeys(CURVE_COLUMNS, str)):
+        name = row["metric"]
+        if name.removeprefix(EVALUATION) in METRICS:
+            series.setdefault(name, []).append(row | _settings(cell, columns))
     return [row for rows in series.values() for row in thin(rows)]
 
 
@@ -118,12 +116,9 @@ def _untrained_rows(cell: Cell, runs: Path, columns: Sequence[str]) -> list[Row]
 
 def episode_rows(cell: Cell, runs: Path, columns: Sequence[str]) -> list[Row]:
     """Return the main metrics of every episode of a run's final evaluation."""
-    with (runs / cell.name / EVAL_CSV).open(newline="") as file:
-        return [
-            row | _settings(cell, columns)
-            for row in csv.DictReader(file)
-            if row["metric"] in METRICS
-        ]
+    path = runs / cell.name / EVAL_CSV
+    rows = files.read_rows(path, "the evaluation of a run", dict.fromkeys(EPISODE_COLUMNS, str))
+    return [row | _settings(cell, columns) for row in rows if row["metric"] in METRICS]
 
 
 def _settings(cell: Cell, columns: Sequence[str]) -> Row:
@@ -144,16 +139,9 @@ def write_table(
     path: Path, notes: Sequence[str], columns: Sequence[str], rows: Sequence[Row]
 ) -> None:
     """Write comment lines and rows, whole or not at all; numbers with six digits."""
-    text = io.StringIO()
-    text.write("".join(f"{line}\n" for line in notes))
-    writer = csv.DictWriter(text, columns, lineterminator="\n", extrasaction="ignore")
-    writer.writeheader()
-    for row in rows:
-        short = {"value": f"{float(row['value']):.6g}"}
-        if "wall_s" in row:
-            short["wall_s"] = f"{float(row['wall_s']):.1f}"
-        writer.writerow(row | short)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(path.name + ".partial")
-    partial.write_text(text.getvalue(), encoding="utf-8")
-    partial.replace(path)
+    digits = {"value": ".6g", "wall_s": ".1f"}
+    cells = [
+        [format(float(row[c]), digits[c]) if c in digits else row.get(c, "") for c in columns]
+        for row in rows
+    ]
+    files.write_csv(path, [columns, *cells], notes="".join(f"{line}\n" for line in notes))

@@ -8,14 +8,13 @@ grid, preset or source never continues or counts the run of another.
 
 from __future__ import annotations
 
-import csv
 import dataclasses
 import hashlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Literal
 
-from twirl_mjx import config_json
+from twirl_mjx import config_json, files
 from twirl_mjx.config import TrainConfig
 from twirl_mjx.presets import make_config
 from twirl_mjx.sweep.grid import Draft, Grid, configure
@@ -172,9 +171,8 @@ def _identity_of_path(path: Path) -> str:
     if path.is_dir():
         steps = evaluated_steps(path)
         return f"{path.name} {rundir.digest(rundir.read_config(path))} at {steps}"
-    if not path.is_file():
-        raise FileNotFoundError(f"no source policy {path}")
-    return f"{path.name} {hashlib.sha256(path.read_bytes()).hexdigest()[:12]}"
+    content = files.read_bytes(path, "a source policy")
+    return f"{path.name} {hashlib.sha256(content).hexdigest()[:12]}"
 
 
 def run_name(config: TrainConfig) -> str:
@@ -189,9 +187,8 @@ def evaluated_steps(run_dir: Path) -> int | None:
     path = run_dir / EVAL_CSV
     if not path.is_file():
         return None
-    with path.open(newline="") as file:
-        row = next(csv.DictReader(file), None)
-    return None if row is None else int(row["env_steps"])
+    rows = files.read_rows(path, "the evaluation of a run", {"env_steps": int})
+    return rows[0]["env_steps"] if rows else None
 
 
 def reached_steps(run_dir: Path) -> int:
@@ -199,11 +196,8 @@ def reached_steps(run_dir: Path) -> int:
     path = run_dir / METRICS_CSV
     if not path.is_file():
         return 0
-    with path.open("rb") as file:
-        file.seek(0, 2)
-        file.seek(max(0, file.tell() - 4096))
-        lines = file.read().decode(errors="replace").splitlines(keepends=True)
-    for line in reversed(lines):
+    tail = files.read_tail(path, "the metrics of a run", 4096)
+    for line in reversed(tail.decode(errors="replace").splitlines(keepends=True)):
         cells = line.split(",")
         if line.endswith("\n") and len(cells) == 10 and cells[6].isdigit():
             return int(cells[6])

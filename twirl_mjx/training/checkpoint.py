@@ -164,10 +164,7 @@ class Checkpoints:
             return
         rows = np.asarray(state.replay.online.rows)[np.arange(first, total) % capacity]
         target = self._replay / f"rows_{first:012d}_{total:012d}.npy"
-        partial = target.with_suffix(".partial")
-        with partial.open("wb") as file:
-            np.save(file, rows)
-        partial.replace(target)
+        files.write_npy(target, rows)
 
     def _logged(self, step: int) -> int:
         """Return how many rows had been inserted at a checkpoint."""
@@ -218,7 +215,7 @@ def _stored_rows(folder: Path, begin: int, end: int) -> Iterator[tuple[int, np.n
             continue
         if first > have:
             break
-        part = np.load(path)[have - first : end - first]
+        part = files.read_npy(path, "rows of a replay log")[have - first : end - first]
         yield have, part
         have += len(part)
     if have < end:

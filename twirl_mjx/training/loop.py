@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import dataclasses
 import math
 import threading
@@ -15,6 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from twirl_mjx import files
 from twirl_mjx.config import TrainConfig
 from twirl_mjx.droq import learner as droq
 from twirl_mjx.droq.state import DroqState
@@ -36,6 +36,8 @@ EVAL_CSV = "eval.csv"
 EVAL_COLUMNS = (
     "run", "task", "shift", "variant", "seed", "env_steps", "episode", "metric", "value",
 )  # fmt: skip
+EVAL_CELLS = {"env_steps": int, "metric": str, "value": float}
+"""Columns that are read back, with what turns their cells into values."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -292,10 +294,9 @@ def finished(run_dir: Path, total_env_steps: int) -> Outcome | None:
         return None
     values: dict[str, list[float]] = {}
     env_steps = 0
-    with path.open(newline="") as file:
-        for row in csv.DictReader(file):
-            env_steps = int(row["env_steps"])
-            values.setdefault(row["metric"], []).append(float(row["value"]))
+    for row in files.read_rows(path, "the evaluation of a run", EVAL_CELLS):
+        env_steps = row["env_steps"]
+        values.setdefault(row["metric"], []).append(row["value"])
     if env_steps < total_env_steps:
         return None
     return Outcome(True, env_steps, episode_means({k: np.array(v) for k, v in values.items()}))
@@ -305,12 +306,9 @@ def write_episodes(
     path: Path, identity: dict[str, str], env_steps: int, values: dict[str, np.ndarray]
 ) -> None:
     """Write episode measures [E] as a tidy table, whole or not at all; NaN has no row."""
-    partial = path.with_name(path.name + ".partial")
-    with partial.open("w", newline="") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(EVAL_COLUMNS)
-        for name, column in values.items():
-            for episode in np.flatnonzero(~np.isnan(column)):
-                row = [env_steps, episode, name, f"{float(column[episode]):.9g}"]
-                writer.writerow([*identity.values(), *row])
-    partial.replace(path)
+    rows = [
+        [*identity.values(), env_steps, episode, name, f"{float(column[episode]):.9g}"]
+        for name, column in values.items()
+        for episode in np.flatnonzero(~np.isnan(column))
+    ]
+    files.write_csv(path, [EVAL_COLUMNS, *rows])

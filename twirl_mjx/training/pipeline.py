@@ -8,7 +8,6 @@ shift the source is a finished nominal run of the same task, and its replay is t
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import hashlib
 import json
 from collections.abc import Callable
@@ -18,7 +17,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from twirl_mjx import config_json, exits
+from twirl_mjx import config_json, exits, files
+from twirl_mjx.checks import choose_one
 from twirl_mjx.config import SCRIPTED_SOURCES, TrainConfig
 from twirl_mjx.droq.state import DroqState
 from twirl_mjx.policies.resolve import resolve_policy
@@ -169,11 +169,7 @@ def no_such_source(path: Path, runs_dir: Path) -> str:
     """Return what can be given instead of a source that does not exist."""
     runs = sorted(str(found.parent) for found in runs_dir.glob("*/policy.npz"))
     choices = [*SCRIPTED_SOURCES, *runs]
-    nearest = difflib.get_close_matches(str(path), choices, n=1, cutoff=0.0)[0]
-    return (
-        f"there is no source {path}: give a policy file, or one of {', '.join(choices)}"
-        f" (nearest: {nearest})"
-    )
+    return f"there is no source {path}: give a policy file, or {choose_one(path.name, choices)}"
 
 
 def scripted_digest(config: TrainConfig) -> str:
@@ -211,7 +207,7 @@ def _from_path(config: TrainConfig, path: Path) -> Source:
         progress = found.loaded.header.card.get("env_steps")
         digest = f"{rundir.digest(rundir.read_config(path))}@{progress}"
         return Source(found.policy, str(path), digest, found.loaded, path)
-    digest = hashlib.sha256(path.read_bytes()).hexdigest()[:12]
+    digest = hashlib.sha256(files.read_bytes(path, "a policy")).hexdigest()[:12]
     return Source(found.policy, str(path), digest, found.loaded)
 
 

@@ -16,7 +16,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-from twirl_mjx import config_json, exits
+from twirl_mjx import config_json, exits, files
 from twirl_mjx.config import TASKS, TrainConfig
 
 CONFIG_NAME = "config.json"
@@ -138,7 +138,7 @@ def check_run(run_dir: Path, config: TrainConfig, source: dict[str, str] | None 
     """
     path = run_dir / CONFIG_NAME
     if path.exists() and any((run_dir / name).exists() for name in WORK):
-        old = config_json.from_json(path.read_text())
+        old = _read_config(path)
         changed, free = config_json.diff(old, config), may_change(config)
         lines = [line for line in changed if not line.startswith(free)]
         known = read_source(run_dir)
@@ -160,16 +160,21 @@ def open_run(run_dir: Path, config: TrainConfig, source: dict[str, str] | None =
     """
     check_run(run_dir, config, source)
     run_dir.mkdir(parents=True, exist_ok=True)
-    _write(run_dir / CONFIG_NAME, config_json.to_json(config))
+    files.write_text(run_dir / CONFIG_NAME, config_json.to_json(config))
     if source:
-        _write(run_dir / SOURCE_NAME, json.dumps(source, indent=2, sort_keys=True) + "\n")
-    _write(run_dir / VERSIONS_NAME, json.dumps(versions(), indent=2, sort_keys=True) + "\n")
+        files.write_json(run_dir / SOURCE_NAME, source)
+    files.write_json(run_dir / VERSIONS_NAME, versions())
 
 
 def read_source(run_dir: Path) -> dict[str, str] | None:
     """Return ``origin`` and ``digest`` of a run's source, None when it has (or recorded) none."""
     path = run_dir / SOURCE_NAME
-    return json.loads(path.read_text()) if path.is_file() else None
+    if not path.exists():
+        return None
+    found = files.read_json(path, "the source of a run")
+    if not isinstance(found, dict) or not {"origin", "digest"} <= found.keys():
+        raise files.FileError(f"{path} holds {found!r}, expected origin and digest of a source")
+    return found
 
 
 def read_config(run_dir: Path) -> TrainConfig:
@@ -186,7 +191,16 @@ def read_config(run_dir: Path) -> TrainConfig:
             f"{run_dir} is not a run: it has no {CONFIG_NAME}; runs in {parent}:"
             f" {', '.join(runs) or 'none'}"
         )
-    return config_json.from_json(path.read_text())
+    return _read_config(path)
+
+
+def _read_config(path: Path) -> TrainConfig:
+    what = "the config of a run"
+    record = files.read_json(path, what)
+    try:
+        return config_json.from_dict(TrainConfig, record)
+    except (TypeError, ValueError, AttributeError) as error:
+        raise ValueError(f"{path}: {error}; expected {what}") from error
 
 
 @functools.cache
@@ -220,12 +234,6 @@ def _commit() -> str:
     except (OSError, subprocess.TimeoutExpired):
         return "unknown"
     return out.stdout.strip() or "unknown"
-
-
-def _write(path: Path, text: str) -> None:
-    partial = path.with_name(path.name + ".partial")
-    partial.write_text(text)
-    partial.replace(path)
 
 
 def identity(run_dir: Path, config: TrainConfig) -> dict[str, str]:
