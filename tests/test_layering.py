@@ -14,7 +14,17 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = "twirl_mjx"
 
-BASE = {"types", "checks", "exits", "files", "config", "presets", "config_json", "assets"}
+BASE = {
+    "types",
+    "checks",
+    "exits",
+    "files",
+    "array_files",
+    "config",
+    "presets",
+    "config_json",
+    "assets",
+}
 WORLD = BASE | {"sim", "motion"}
 ACTING = WORLD | {"tasks", "droq", "policies"}
 ALLOWED: dict[str, set[str]] = {
@@ -22,6 +32,7 @@ ALLOWED: dict[str, set[str]] = {
     "checks": set(),
     "exits": set(),
     "files": {"checks"},
+    "array_files": {"files"},
     "faults": {"exits"},
     "assets": set(),
     "config": {"types", "checks"},
@@ -30,7 +41,7 @@ ALLOWED: dict[str, set[str]] = {
     "sim": BASE,
     "motion": WORLD,
     "tasks": WORLD,
-    "replay": {"types", "checks", "files", "config"},
+    "replay": {"types", "checks", "files", "array_files", "config"},
     "droq": {"types", "checks", "config"},
     "policies": ACTING,
     "evaluation": ACTING,

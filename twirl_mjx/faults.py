@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 from twirl_mjx import exits
 
-NO_SPACE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
+NO_SPACE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 UNUSABLE = (
     errno.ENOENT, errno.EISDIR, errno.ENOTDIR, errno.EACCES, errno.EPERM, errno.EEXIST,
     errno.EROFS, errno.ELOOP, errno.ENAMETOOLONG, errno.EINVAL, errno.ENXIO, errno.ENOTEMPTY,
@@ -18,7 +18,9 @@ UNUSABLE = (
 NO_SPACE_TEXT = re.compile("No space left on device|Disk quota exceeded")
 """How libraries that hide the number of an error say it."""
 NO_MEMORY_TEXT = re.compile("RESOURCE_EXHAUSTED|[Oo]ut of memory|bad_alloc")
-CALLED_BACK = re.compile(r"^(?:\w+\.)*(\w+): ((?:(?!^\s+File ).)*)\Z", re.DOTALL | re.MULTILINE)
+CALLED_BACK = re.compile(
+    r"^(?:\w+\.)*(\w+)(?:: ((?:(?!^\s+File ).)*))?\Z", re.DOTALL | re.MULTILINE
+)
 """Name and message of the error at the end of a traceback that jax has put into a text."""
 
 
@@ -66,7 +68,7 @@ def explain(error: BaseException) -> Fault:
 
 
 def _without_space(error: BaseException) -> str | None:
-    """Return what a full or broken disk says, wherever in the chain of causes it stands."""
+    """Return what a full disk says, wherever in the chain of causes it stands."""
     link: BaseException | None = error
     while link is not None:
         if isinstance(link, OSError) and link.errno in NO_SPACE:
@@ -90,7 +92,7 @@ def _from_callback(text: str) -> Fault | None:
     if found[1] == "KeyboardInterrupt":
         return Fault("interrupted", exits.STOPPED)
     refused = found[1] == "ValueError" or found[1].endswith("FileError")
-    told = found[2].strip()
+    told = (found[2] or "").strip()
     return Fault(told if refused else f"{found[1]}: {told}", exits.UNUSABLE if refused else 1)
 
 

@@ -6,7 +6,7 @@ removed and what was there before is untouched. Only regular files are replaced:
 socket or folder is refused by name, and of a symbolic link the file that it leads to is replaced.
 
 *Reading*: regular files of a bounded size, and errors that name the file, what was expected and
-what helps. Arrays are read without pickles, and only what the file really holds is allocated.
+what helps. Arrays: ``array_files``.
 """
 
 from __future__ import annotations
@@ -16,25 +16,19 @@ import csv
 import errno
 import io
 import json
-import math
 import os
 import secrets
 import stat
-import zipfile
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, BinaryIO
 
-import numpy as np
-
 MB = 1 << 20
 TEXT_LIMIT = 256 * MB
 """Bytes, largest text that is read; a table of a million rows has a third of it."""
-ARRAYS_LIMIT = 16 << 10 << 20
-"""Bytes, most that the arrays of one file may hold: a million source rows have a tenth of it."""
-MAX_RATIO = 100
-"""Arrays of more than 64 MB may be compressed to this share at best: zeros only are smaller."""
+SIZE_LIMIT = 16 << 10 << 20
+"""Bytes, largest file that is read: a million source rows have a tenth of it."""
 
 _KINDS = (
     (stat.S_ISDIR, "a folder"),
@@ -121,24 +115,6 @@ def write_csv(path: str | Path, rows: Iterable[Sequence[object]], notes: str = "
     write_text(path, notes + text.getvalue())
 
 
-def write_npy(path: str | Path, array: np.ndarray) -> None:
-    """Write one array of numbers as ``.npy``, whole or not at all."""
-    array = np.asarray(array, order="C")
-    with write_atomic(path) as file:
-        header = np.lib.format.header_data_from_array_1_0(array)
-        np.lib.format.write_array_header_1_0(file, header)
-        file.write(array.data)  # numpy's own tofile hides why a disk refuses
-
-
-def write_npz(
-    path: str | Path, arrays: Mapping[str, np.ndarray], *, compressed: bool = False
-) -> None:
-    """Write arrays as ``.npz``, whole or not at all; equal arrays give equal bytes."""
-    save = np.savez_compressed if compressed else np.savez
-    with write_atomic(path) as file:
-        save(file, allow_pickle=False, **arrays)  # pyright: ignore[reportArgumentType]
-
-
 def check_target(path: str | Path) -> Path:
     """Return the file to replace, links followed, after checking that it can be replaced.
 
@@ -194,7 +170,7 @@ def _sweep(folder: Path, mark: str) -> None:
 # ---- reading
 
 
-def check_readable(path: str | Path, what: str, limit: int = ARRAYS_LIMIT, remedy: str = "") -> int:
+def check_readable(path: str | Path, what: str, limit: int = SIZE_LIMIT, remedy: str = "") -> int:
     """Check that a path leads to a regular file of at most ``limit`` bytes; return its size.
 
     Args:
@@ -211,26 +187,26 @@ def check_readable(path: str | Path, what: str, limit: int = ARRAYS_LIMIT, remed
     try:
         status = os.stat(path)
     except FileNotFoundError:
-        raise FileNotFoundError(f"{path}: no such file, expected {what}{_then(remedy)}") from None
+        raise FileNotFoundError(f"{path}: no such file, expected {what}{then(remedy)}") from None
     except ValueError as error:  # a NUL in the name
         raise FileError(f"{str(path)!r} is no name of a file: {error}") from error
     if not stat.S_ISREG(status.st_mode):
         kind = _kind(status.st_mode)
-        raise FileError(f"{path} is {kind}, expected {what} in a file{_then(remedy)}")
+        raise FileError(f"{path} is {kind}, expected {what} in a file{then(remedy)}")
     if status.st_size > limit:
         raise FileError(
-            f"{path} has {status.st_size:,} bytes, {what} has at most {limit:,}{_then(remedy)}"
+            f"{path} has {status.st_size:,} bytes, {what} has at most {limit:,}{then(remedy)}"
         )
     return status.st_size
 
 
-def read_bytes(path: str | Path, what: str, limit: int = ARRAYS_LIMIT, remedy: str = "") -> bytes:
+def read_bytes(path: str | Path, what: str, limit: int = SIZE_LIMIT, remedy: str = "") -> bytes:
     """Return the content of a regular file; arguments and errors of :func:`check_readable`."""
     check_readable(path, what, limit, remedy)
     with open(path, "rb") as file:
         content = file.read(limit + 1)  # a file of /proc says that it is empty
     if len(content) > limit:
-        raise FileError(f"{path} is larger than {limit:,} bytes, expected {what}{_then(remedy)}")
+        raise FileError(f"{path} is larger than {limit:,} bytes, expected {what}{then(remedy)}")
     return content
 
 
@@ -253,7 +229,7 @@ def read_text(path: str | Path, what: str, limit: int = TEXT_LIMIT, remedy: str 
         return content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise FileError(
-            f"{path}: byte {error.start}: not UTF-8 text, expected {what}{_then(remedy)}"
+            f"{path}: byte {error.start}: not UTF-8 text, expected {what}{then(remedy)}"
         ) from error
 
 
@@ -270,7 +246,7 @@ def read_json(path: str | Path, what: str, limit: int = TEXT_LIMIT, remedy: str 
         why = f"line {error.lineno}, column {error.colno}: not JSON: {error.msg}"
     except (ValueError, RecursionError) as error:
         why = f"not JSON that can be read: {error}"
-    raise FileError(f"{path}: {why}; expected {what}{_then(remedy)}")
+    raise FileError(f"{path}: {why}; expected {what}{then(remedy)}")
 
 
 def read_rows(
@@ -298,10 +274,10 @@ def read_rows(
     text = read_text(path, what, remedy=remedy)
     if growing:
         text = text[: text.rfind("\n") + 1]
-    lines = io.StringIO(text, newline="")
-    reader = csv.reader(line for line in lines if not line.startswith("#"))
+    lines = io.StringIO(text, newline="").readlines()
+    notes = next((i for i, line in enumerate(lines) if not line.startswith("#")), len(lines))
+    reader = csv.reader(lines[notes:])
     found: list[dict[str, Any]] = []
-    header: list[str] = []
     try:
         header = next(reader, [])
         for name in columns:
@@ -313,97 +289,15 @@ def read_rows(
             row = dict(zip(header, cells, strict=True))
             found.append(row | {name: convert(row[name]) for name, convert in columns.items()})
     except (csv.Error, ValueError, OverflowError) as error:
-        where = f"row {len(found) + 1}" if header else "header"
-        raise FileError(f"{path}: {where}: {error}; expected {what}{_then(remedy)}") from error
+        where = f"line {notes + reader.line_num}"
+        raise FileError(f"{path}: {where}: {error}; expected {what}{then(remedy)}") from error
     return found
-
-
-def read_npy(path: str | Path, what: str, limit: int = ARRAYS_LIMIT) -> np.ndarray:
-    """Return the array of a ``.npy`` file, checked as those of :func:`read_npz`.
-
-    Raises:
-        FileError: As :func:`read_npz`.
-    """
-    size = check_readable(path, what, limit)
-    with open(path, "rb") as file, _named(path, ".npy file", what):
-        return _read_array(file, size)
-
-
-def read_npz(path: str | Path, what: str, limit: int = ARRAYS_LIMIT) -> dict[str, np.ndarray]:
-    """Return the arrays of a ``.npz`` archive by name; nothing is unpickled.
-
-    The sizes that the archive and the headers of its arrays declare are compared with each other,
-    with ``limit`` and with the size of the file before anything is allocated.
-
-    Raises:
-        FileError: As :func:`check_readable`, or no such archive; the message has the reason.
-    """
-    size = check_readable(path, what, limit)
-    with open(path, "rb") as file, _named(path, ".npz archive", what):
-        if file.read(6) == np.lib.format.MAGIC_PREFIX:
-            raise ValueError("it holds one array, not an archive")
-        with zipfile.ZipFile(file) as archive:
-            members = {info.filename: info for info in archive.infolist()}
-            total = sum(info.file_size for info in members.values())
-            if total > min(limit, max(64 * MB, MAX_RATIO * size)):
-                raise ValueError(f"{size:,} bytes that would become {total:,}")
-            arrays = {}
-            for name, info in members.items():
-                with archive.open(info) as member:
-                    arrays[name.removesuffix(".npy")] = _read_array(member, info.file_size)
-            return arrays
-
-
-def _read_array(file: Any, size: int) -> np.ndarray:
-    """Return the array of a stream in numpy's format that has ``size`` bytes.
-
-    Raises:
-        ValueError: Its header does not describe ``size`` bytes, or it holds Python objects.
-    """
-    version = np.lib.format.read_magic(file)
-    read = {
-        (1, 0): np.lib.format.read_array_header_1_0,
-        (2, 0): np.lib.format.read_array_header_2_0,
-    }.get(version)
-    if read is None:
-        raise ValueError(f"an array of format {version}, need (1, 0) or (2, 0)")
-    shape, fortran, dtype = read(file)
-    if dtype.hasobject:
-        raise ValueError("an array of Python objects, which are not loaded")
-    if not dtype.itemsize or min(shape, default=0) < 0:
-        raise ValueError(f"an array of shape {shape} and type {dtype!r}")
-    expected = math.prod(shape) * dtype.itemsize
-    found = size - file.tell()
-    if expected != found:
-        raise ValueError(
-            f"an array of shape {shape} and type {dtype} has {expected:,} bytes, the file {found:,}"
-        )
-    content = bytearray(expected)
-    view = memoryview(content)
-    while len(view):
-        count = file.readinto(view[:MB])
-        if not count:
-            raise EOFError("it ends within an array")
-        view = view[count:]
-    file.read(1)  # the end of a member of an archive, where its checksum is compared
-    return np.frombuffer(content, dtype).reshape(shape, order="F" if fortran else "C")
-
-
-@contextlib.contextmanager
-def _named(path: str | Path, kind: str, what: str) -> Iterator[None]:
-    """Turn what a damaged file makes its parser raise into one error that names the file."""
-    try:
-        yield
-    except (
-        zipfile.BadZipFile, zlib.error, EOFError, ValueError, TypeError, KeyError, IndexError,
-        OverflowError, RuntimeError, SyntaxError,
-    ) as error:  # fmt: skip
-        raise FileError(f"{path} is not a readable {kind}: {error}; expected {what}") from error
 
 
 def _kind(mode: int) -> str:
     return next((name for test, name in _KINDS if test(mode)), "no regular file")
 
 
-def _then(remedy: str) -> str:
+def then(remedy: str) -> str:
+    """Return a remedy as the last clause of a message."""
     return f"; {remedy}" if remedy else ""

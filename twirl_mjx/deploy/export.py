@@ -103,7 +103,7 @@ def export_onnx(policy: NumpyPolicy | str | Path, out: str | Path) -> Path:
     model = build_graph(loaded)
     onnx.checker.check_model(model)
     with files.replacing(out) as temporary:
-        temporary.write_bytes(model.SerializeToString())
+        onnx.save(model, str(temporary))
         difference = max_difference(loaded, temporary)
         if not difference <= TOLERANCE:
             raise ValueError(

@@ -235,9 +235,8 @@ def select(table: Table, **equals: object) -> Table:
         hits = table[name] == value
         if not hits.any():
             known = unique(table, name)
-            raise TableError(
-                f"{table.source}: no row with {name} '{value}': {choose_one(value, known)}"
-            )
+            advice = choose_one(value, known)
+            raise TableError(f"{table.source}: no row with {name} '{value}': {advice}")
         rows &= hits
     return mask(table, rows)
 

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from twirl_mjx import files
+from twirl_mjx import array_files, files
 
 if TYPE_CHECKING:
     from twirl_mjx.policies.onnx_file import OnnxPolicy
@@ -101,7 +101,7 @@ class PolicyHeader:
         """
         try:
             record = json.loads(text)
-        except json.JSONDecodeError as error:
+        except (ValueError, RecursionError) as error:
             raise PolicyFileError(f"the header is not JSON: {error}") from error
         if not isinstance(record, dict) or record.pop("format", None) != FORMAT:
             raise PolicyFileError(f"the header is not marked as {FORMAT!r}")
@@ -113,7 +113,9 @@ class PolicyHeader:
             )
         try:
             return cls(**record)
-        except TypeError as error:
+        except PolicyFileError:
+            raise
+        except (TypeError, ValueError, OverflowError) as error:
             raise PolicyFileError(f"the header has wrong fields: {error}") from error
 
     def component(self, index: int) -> str:
@@ -255,14 +257,14 @@ def save_policy(
     params = _as_params(actor_params)
     check_params(params, header.observation_size, header.action_size)
     arrays = {f"{la}/{n}": v for la, values in params.items() for n, v in sorted(values.items())}
-    files.write_npz(path, {"header": np.array(header.to_json())} | arrays, compressed=True)
+    array_files.write_npz(path, {"header": np.array(header.to_json())} | arrays, compressed=True)
     return path
 
 
 def _read_npz(path: Path) -> NumpyPolicy:
     """Read one policy file; every failure becomes a ``PolicyFileError`` with the reason."""
     try:
-        arrays = files.read_npz(path, "a policy", LIMIT)
+        arrays = array_files.read_npz(path, "a policy", LIMIT)
     except files.FileError as error:
         raise PolicyFileError(str(error)) from error
     text = arrays.pop("header", None)
@@ -276,7 +278,7 @@ def _read_npz(path: Path) -> NumpyPolicy:
         header = PolicyHeader.from_json(str(text))
         params = _as_params(params)
         check_params(params, header.observation_size, header.action_size)
-    except PolicyFileError as error:
+    except (TypeError, ValueError) as error:
         raise PolicyFileError(f"{path}: {error}") from error
     return NumpyPolicy(header, params)
 

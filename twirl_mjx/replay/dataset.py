@@ -10,7 +10,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from twirl_mjx import files
+from twirl_mjx import array_files, files
 from twirl_mjx.types import Transition
 
 FORMAT = "twirl-source-dataset"
@@ -56,7 +56,7 @@ def write(path: Path, header: DatasetHeader, data: Transition) -> None:
     """
     text = json.dumps(dataclasses.asdict(header), sort_keys=True)
     arrays: dict[str, Any] = {name: np.asarray(getattr(data, name)) for name in FIELDS}
-    files.write_npz(path, {"header": np.array(text)} | arrays)
+    array_files.write_npz(path, {"header": np.array(text)} | arrays)
 
 
 def read(
@@ -89,6 +89,8 @@ def read(
         if name not in arrays or arrays[name].shape != shape:
             found = arrays[name].shape if name in arrays else "nothing"
             raise DatasetError(f"{path}: {name} has shape {found}, the header says {shape}")
+        if arrays[name].dtype.kind not in "fb":
+            raise DatasetError(f"{path}: {name} is of type {arrays[name].dtype}, need numbers")
         bad = ~np.isfinite(arrays[name]).reshape(header.size, -1).all(axis=1)
         if bad.any():
             raise DatasetError(f"{path}: {name} is not finite in row {int(np.argmax(bad))}")
@@ -98,15 +100,16 @@ def read(
 
 
 def _load(path: Path) -> tuple[DatasetHeader, dict[str, np.ndarray]]:
+    remedy = "remove it and collect again"
     try:
-        arrays = files.read_npz(path, "a source dataset")
+        arrays = array_files.read_npz(path, "a source dataset", remedy=remedy)
         record = json.loads(str(arrays.pop("header")))
-        if not isinstance(record, dict):
-            raise ValueError(f"its header is {record!r}, not a JSON object")
+    except files.FileError as error:
+        raise DatasetError(str(error)) from error
     except (ValueError, KeyError, RecursionError) as error:
-        raise DatasetError(
-            f"{path} is not a readable source dataset: {error}; remove it and collect again"
-        ) from error
+        raise DatasetError(f"{path}: no header that can be read: {error}; {remedy}") from error
+    if not isinstance(record, dict):
+        raise DatasetError(f"{path}: its header is {record!r}, not a JSON object; {remedy}")
     if record.get("format") != FORMAT or record.get("version") != VERSION:
         raise DatasetError(
             f"{path} is {record.get('format')!r} version {record.get('version')}, this program"

@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 import orbax.checkpoint as ocp
 
+from twirl_mjx import array_files
 from twirl_mjx.training import rundir
 from twirl_mjx.training.state import TrainState
 
@@ -164,7 +165,7 @@ class Checkpoints:
             return
         rows = np.asarray(state.replay.online.rows)[np.arange(first, total) % capacity]
         target = self._replay / f"rows_{first:012d}_{total:012d}.npy"
-        files.write_npy(target, rows)
+        array_files.write_npy(target, rows)
 
     def _logged(self, step: int) -> int:
         """Return how many rows had been inserted at a checkpoint."""
@@ -215,7 +216,7 @@ def _stored_rows(folder: Path, begin: int, end: int) -> Iterator[tuple[int, np.n
             continue
         if first > have:
             break
-        part = files.read_npy(path, "rows of a replay log")[have - first : end - first]
+        part = array_files.read_npy(path, "rows of a replay log")[have - first : end - first]
         yield have, part
         have += len(part)
     if have < end:
