@@ -87,23 +87,33 @@ def _import_quietly(module: str) -> Any:
 
 @contextlib.contextmanager
 def _one_line_each(name: str) -> Iterator[None]:
-    """Show what fails in threads and finalizers as one line, too, and not what jax logs of it."""
+    """Show what fails in threads and finalizers as one line, too, without tracebacks in logs.
+
+    Of finalizers only system errors are shown: what they could not write is lost.
+    """
 
     def in_thread(args: threading.ExceptHookArgs) -> None:
         if args.exc_value is not None and not isinstance(args.exc_value, SystemExit):
             _complain(name, f"in the background: {faults.explain(args.exc_value).text}")
 
     def in_finalizer(args: Any) -> None:
-        if args.exc_value is not None:
+        if isinstance(args.exc_value, OSError):
             _complain(name, f"while closing: {faults.explain(args.exc_value).text}")
 
-    logger = logging.getLogger("jax._src.callback")
-    old = threading.excepthook, sys.unraisablehook, logger.disabled
-    threading.excepthook, sys.unraisablehook, logger.disabled = in_thread, in_finalizer, True
+    def is_new(record: logging.LogRecord) -> bool:  # what is logged with a traceback is raised, too
+        return not record.exc_info
+
+    loggers = [logging.getLogger(n) for n in ("absl", "jax._src.callback")]
+    old = threading.excepthook, sys.unraisablehook
+    threading.excepthook, sys.unraisablehook = in_thread, in_finalizer
+    for logger in loggers:
+        logger.addFilter(is_new)
     try:
         yield
     finally:
-        threading.excepthook, sys.unraisablehook, logger.disabled = old
+        threading.excepthook, sys.unraisablehook = old
+        for logger in loggers:
+            logger.removeFilter(is_new)
 
 
 def _complain(name: str, text: str) -> None:

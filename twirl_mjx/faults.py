@@ -19,7 +19,7 @@ NO_SPACE_TEXT = re.compile("No space left on device|Disk quota exceeded")
 """How libraries that hide the number of an error say it."""
 NO_MEMORY_TEXT = re.compile("RESOURCE_EXHAUSTED|[Oo]ut of memory|bad_alloc")
 CALLED_BACK = re.compile(
-    r"^(?:\w+\.)*(\w+)(?:: ((?:(?!^\s+File ).)*))?\Z", re.DOTALL | re.MULTILINE
+    r"^(?:\w+\.)*(\w+)(?:: ?((?:(?!^\s+File ).)*))?\Z", re.DOTALL | re.MULTILINE
 )
 """Name and message of the error at the end of a traceback that jax has put into a text."""
 
