@@ -15,8 +15,12 @@ UNUSABLE = (
     errno.EROFS, errno.ELOOP, errno.ENAMETOOLONG, errno.EINVAL, errno.ENXIO, errno.ENOTEMPTY,
 )  # fmt: skip
 """What paths given by a person may lead to."""
-NO_SPACE_TEXT = re.compile("No space left on device|Disk quota exceeded")
-"""How libraries that hide the number of an error say it."""
+NO_SPACE_TEXT = re.compile(
+    r'(?:"(?P<file>/[^"]+)"[^"]*)?(?P<why>No space left on device|Disk quota exceeded)'
+)
+"""How libraries that hide the number of an error say it, after a file in quotes or without one."""
+SAVED = "saved: "
+"""Begin of a note (``add_note``) on an error that says what is safe on disk."""
 NO_MEMORY_TEXT = re.compile("RESOURCE_EXHAUSTED|[Oo]ut of memory|bad_alloc")
 CALLED_BACK = re.compile(
     r"^(?:\w+\.)*(\w+)(?:: ?((?:(?!^\s+File ).)*))?\Z", re.DOTALL | re.MULTILINE
@@ -43,7 +47,9 @@ def explain(error: BaseException) -> Fault:
     if isinstance(error, KeyboardInterrupt):
         return Fault("interrupted", exits.STOPPED)
     if full := _without_space(error):
-        return Fault(f"{full}: free space, then run the same command again", exits.NO_SPACE)
+        saved = "".join(f"; {n}" for n in getattr(error, "__notes__", ()) if n.startswith(SAVED))
+        advice = "free space, then run the same command again"
+        return Fault(f"{full}: {advice}{saved}", exits.NO_SPACE)
     if isinstance(error, OSError) and error.errno is not None:
         status = exits.UNUSABLE if error.errno in UNUSABLE else exits.FAILED
         return Fault(_system_text(error), status)
@@ -73,8 +79,9 @@ def _without_space(error: BaseException) -> str | None:
     while link is not None:
         if isinstance(link, OSError) and link.errno in NO_SPACE:
             return _system_text(link)
-        if NO_SPACE_TEXT.search(str(link)):
-            return _first_line(str(link))
+        if found := NO_SPACE_TEXT.search(str(link)):
+            file = found["file"]
+            return f"{file}: {found['why']}" if file else _first_line(str(link))
         link = link.__cause__ or link.__context__
     return None
 

@@ -85,6 +85,20 @@ def test_a_full_disk_is_found_behind_other_errors() -> None:
     assert fault.text.startswith("/some/file: No space left on device: free space")
 
 
+def test_a_full_disk_of_others_is_short_and_says_what_is_saved() -> None:
+    error = ValueError(
+        'RESOURCE_EXHAUSTED: Error writing "env.data/0.0" in database at "/runs/a/": Failed'
+        ' writing: "/runs/a/d/0c99": Failed to write 3823 bytes: No space left on device [code 28]'
+    )
+    error.add_note("For simplicity, some frames were removed")
+    error.add_note("saved: the checkpoint at 32 transitions")
+    assert faults.explain(error) == (
+        "/runs/a/d/0c99: No space left on device: free space, then run the same command again;"
+        " saved: the checkpoint at 32 transitions",
+        exits.NO_SPACE,
+    )
+
+
 def refusing(text: str) -> Any:
     def act(obs: Any) -> Any:
         raise ValueError(text)

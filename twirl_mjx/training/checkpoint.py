@@ -109,6 +109,17 @@ class Checkpoints:
         step = int(state.env_steps)
         if step in self._manager.all_steps():
             return
+        kept = self.latest()
+        try:
+            self._write(step, state, progress)
+        except Exception as error:
+            at = "no checkpoint yet" if kept is None else f"the checkpoint at {kept:,} transitions"
+            error.add_note(f"saved: {at}")
+            raise
+        self._prune(state)
+
+    def _write(self, step: int, state: TrainState, progress: dict[str, Any]) -> None:
+        """Write the rows, then the rest."""
         self._append_rows(state)
         bare = state.replace(replay=state.replay.replace(source=None, online=_bare(state)))
         self._manager.save(
@@ -120,7 +131,6 @@ class Checkpoints:
             ),
         )
         self._manager.wait_until_finished()
-        self._prune(state)
 
     def restore(self, template: TrainState) -> tuple[TrainState, dict[str, Any]]:
         """Return the newest checkpoint as a state shaped like ``template``, and its progress.
