@@ -63,7 +63,7 @@ def replacing(path: str | Path) -> Iterator[Path]:
     """
     target = check_target(path)
     mark = f".twirl-{zlib.crc32(target.name.encode(errors='surrogateescape')):08x}"
-    temporary = target.with_name(f"{mark}-{os.getpid()}-{secrets.token_hex(3)}{target.suffix}")
+    temporary = target.with_name(f"{mark}-{os.getpid()}-{secrets.token_hex(3)}{Path(path).suffix}")
     try:
         _make_folders(target.parent)
         _sweep(target.parent, mark)
@@ -292,6 +292,16 @@ def read_rows(
         where = f"line {notes + reader.line_num}"
         raise FileError(f"{path}: {where}: {error}; expected {what}{then(remedy)}") from error
     return found
+
+
+def number_text(cell: str) -> str:
+    """Return the text of a number as it is, for ``columns`` of :func:`read_rows`.
+
+    Raises:
+        ValueError: It is none.
+    """
+    float(cell)
+    return cell
 
 
 def _kind(mode: int) -> str:

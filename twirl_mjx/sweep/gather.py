@@ -6,7 +6,7 @@ with comment lines that say what was reduced and which command makes the rows ag
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from twirl_mjx import files
@@ -22,6 +22,12 @@ SETTING_COLUMNS = {"phi": "replay.phi", "utd": "droq.utd"}
 """Column -> config field; a table has the columns whose field varies in the grid."""
 
 Row = dict[str, str]
+
+
+def cells_of(columns: Sequence[str]) -> dict[str, Callable[[str], str]]:
+    """Return the check of every column of a run's table: numbers keep their digits."""
+    numbers = ("env_steps", "grad_steps", "wall_s", "value")
+    return {name: files.number_text if name in numbers else str for name in columns}
 
 
 def gather(grid: Grid, cells: Sequence[Cell], runs: Path, results: Path) -> list[Path]:
@@ -94,7 +100,7 @@ def curve_rows(cell: Cell, runs: Path, columns: Sequence[str]) -> list[Row]:
     if cell.config.variant == "zero-shot" or not path.is_file():
         return _untrained_rows(cell, runs, columns)
     series: dict[str, list[Row]] = {}
-    for row in files.read_rows(path, "the metrics of a run", dict.fromkeys(CURVE_COLUMNS, str)):
+    for row in files.read_rows(path, "the metrics of a run", cells_of(CURVE_COLUMNS)):
         name = row["metric"]
         if name.removeprefix(EVALUATION) in METRICS:
             series.setdefault(name, []).append(row | _settings(cell, columns))
@@ -117,7 +123,7 @@ def _untrained_rows(cell: Cell, runs: Path, columns: Sequence[str]) -> list[Row]
 def episode_rows(cell: Cell, runs: Path, columns: Sequence[str]) -> list[Row]:
     """Return the main metrics of every episode of a run's final evaluation."""
     path = runs / cell.name / EVAL_CSV
-    rows = files.read_rows(path, "the evaluation of a run", dict.fromkeys(EPISODE_COLUMNS, str))
+    rows = files.read_rows(path, "the evaluation of a run", cells_of(EPISODE_COLUMNS))
     return [row | _settings(cell, columns) for row in rows if row["metric"] in METRICS]
 
 

@@ -149,22 +149,14 @@ def truncate_csv(path: Path, env_steps: int) -> float:
         ValueError: the file has other columns, or a damaged row before its last.
     """
     what = f"a metrics table with columns {','.join(COLUMNS)}"
-    rows = files.read_rows(path, what, {"env_steps": int, "wall_s": _number_text}, growing=True)
+    rows = files.read_rows(
+        path, what, {"env_steps": int, "wall_s": files.number_text}, growing=True
+    )
     if rows and tuple(rows[0]) != COLUMNS:
         raise ValueError(f"{path} has columns {list(rows[0])}, expected {list(COLUMNS)}")
     kept = [row for row in rows if row["env_steps"] <= env_steps]
     files.write_csv(path, [COLUMNS, *(row.values() for row in kept)])
     return float(kept[-1]["wall_s"]) if kept else 0.0
-
-
-def _number_text(cell: str) -> str:
-    """Return the text of a number as it is.
-
-    Raises:
-        ValueError: It is none.
-    """
-    float(cell)
-    return cell
 
 
 class RunLogger:
