@@ -10,7 +10,7 @@ import os
 import sys
 import threading
 import traceback
-from collections.abc import Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -85,11 +85,13 @@ def _import_quietly(module: str) -> Any:
         return importlib.import_module(module)
 
 
-@contextlib.contextmanager
-def _one_line_each(name: str) -> Iterator[None]:
+def _show_one_line_each(name: str) -> Callable[[], None]:
     """Show what fails in threads and finalizers as one line, too, without tracebacks in logs.
 
     Of finalizers only system errors are shown: what they could not write is lost.
+
+    Returns:
+        What undoes it.
     """
 
     def in_thread(args: threading.ExceptHookArgs) -> None:
@@ -108,12 +110,13 @@ def _one_line_each(name: str) -> Iterator[None]:
     threading.excepthook, sys.unraisablehook = in_thread, in_finalizer
     for logger in loggers:
         logger.addFilter(is_new)
-    try:
-        yield
-    finally:
+
+    def undo() -> None:
         threading.excepthook, sys.unraisablehook = old
         for logger in loggers:
             logger.removeFilter(is_new)
+
+    return undo
 
 
 def _complain(name: str, text: str) -> None:
@@ -126,6 +129,7 @@ def main(argv: list[str] | None = None) -> int:
     Returns:
         Exit status: 0 done, else one of ``exits``.
     """
+    owns_process = argv is None
     argv = list(sys.argv[1:] if argv is None else argv)
     if not argv or argv[0] in ("-h", "--help"):
         print(_usage(), end="")
@@ -137,22 +141,25 @@ def main(argv: list[str] | None = None) -> int:
         print(_usage(), end="", file=sys.stderr)
         return exits.UNUSABLE
     debug = os.environ.get("TWIRL_DEBUG", "") not in ("", "0")
-    with contextlib.nullcontext() if debug else _one_line_each(name):
-        try:
-            _set_environment()
-            if name in DRAWING:  # these parse their options before they import the simulation
-                return _import_command(name).main(rest, set_up)
-            os.environ.setdefault("MUJOCO_GL", "disable")
-            return _import_command(name).main(rest)
-        except BrokenPipeError:  # the reader of our output, `| head` say, has seen enough
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-            return exits.UNREAD
-        except (Exception, KeyboardInterrupt) as error:
-            if debug:
-                traceback.print_exception(error)
-            fault = faults.explain(error)
-            _complain(name, fault.text)
-            return fault.status
+    undo = (lambda: None) if debug else _show_one_line_each(name)
+    try:
+        _set_environment()
+        if name in DRAWING:  # these parse their options before they import the simulation
+            return _import_command(name).main(rest, set_up)
+        os.environ.setdefault("MUJOCO_GL", "disable")
+        return _import_command(name).main(rest)
+    except BrokenPipeError:  # the reader of our output, `| head` say, has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return exits.UNREAD
+    except (Exception, KeyboardInterrupt) as error:
+        if debug:
+            traceback.print_exception(error)
+        fault = faults.explain(error)
+        _complain(name, fault.text)
+        return fault.status
+    finally:
+        if not owns_process:  # else it holds while the interpreter ends
+            undo()
 
 
 if __name__ == "__main__":

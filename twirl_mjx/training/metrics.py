@@ -155,7 +155,7 @@ def truncate_csv(path: Path, env_steps: int) -> float:
     if rows and tuple(rows[0]) != COLUMNS:
         raise ValueError(f"{path} has columns {list(rows[0])}, expected {list(COLUMNS)}")
     kept = [row for row in rows if row["env_steps"] <= env_steps]
-    files.write_csv(path, [COLUMNS, *(row.values() for row in kept)])
+    files.write_csv(path, [COLUMNS, *(list(row.values()) for row in kept)])
     return float(kept[-1]["wall_s"]) if kept else 0.0
 
 
