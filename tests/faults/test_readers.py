@@ -18,7 +18,7 @@ from twirl_mjx.figures.plots import make_figures
 from twirl_mjx.figures.tables import CURVE_COLUMNS, TableError, read_table
 from twirl_mjx.motion.formats import read_clip
 from twirl_mjx.policies.learned import load_policy
-from twirl_mjx.sweep import estimate, gather, plan
+from twirl_mjx.sweep import gather, plan
 from twirl_mjx.sweep.plan import Cell
 from twirl_mjx.training import loop, metrics, rundir
 
@@ -47,10 +47,9 @@ READERS: dict[str, tuple[str, Callable[[Path], object]]] = {
     "episodes": ("eval.csv", lambda path: gather.episode_rows(CELL, path.parents[1], ())),
     "curves": ("metrics.csv", lambda path: gather.curve_rows(CELL, path.parents[1], ())),
     "resumed metrics": ("metrics.csv", lambda path: metrics.truncate_csv(path, 10)),
-    "speeds": ("metrics.csv", lambda path: estimate._rates(path)),
     "table": ("table.csv", read_table),
 }
-GROWS = ("resumed metrics", "speeds")
+GROWS = ("resumed metrics",)
 """Tables in which a row without its end is no fault."""
 DAMAGE = {
     "bytes": b"\xff\xfe\x00garbage",

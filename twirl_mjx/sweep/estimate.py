@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import csv
 import dataclasses
 import statistics
 from collections.abc import Sequence
@@ -49,10 +51,9 @@ def measure(runs: Path) -> list[Speed]:
     speeds = []
     for path in sorted(runs.glob(f"*/{METRICS_CSV}")):
         try:
-            config = rundir.read_config(path.parent)
-        except (FileNotFoundError, ValueError):
+            config, rates = rundir.read_config(path.parent), _rates(path)
+        except (FileNotFoundError, ValueError, KeyError, csv.Error):
             continue  # not a run of this version: it tells nothing about these
-        rates = _rates(path)
         if rates is not None:
             speeds.append(Speed(_learner(config), _setting(config), *rates))
     return speeds
@@ -61,10 +62,16 @@ def measure(runs: Path) -> list[Speed]:
 def _rates(path: Path) -> tuple[float, float] | None:
     """Return the median transitions and updates per second of the whole rows of a run."""
     values: dict[str, list[float]] = {"env_steps_per_s": [], "updates_per_s": []}
-    cells = {"metric": str, "grad_steps": int, "value": float}
-    for row in files.read_rows(path, "the metrics of a run", cells, growing=True):
-        if row["metric"] in values and row["grad_steps"]:
-            values[row["metric"]].append(row["value"])
+    lines = files.read_text(path, "the metrics of a run").splitlines(keepends=True)
+    rows = csv.reader(line for line in lines if line.endswith("\n"))
+    header = next(rows, [])
+    for cells in rows:
+        if len(cells) != len(header):
+            continue  # cut off by a kill, or being written
+        row = dict(zip(header, cells, strict=True))
+        if row.get("metric") in values and row["grad_steps"] not in ("", "0"):
+            with contextlib.suppress(ValueError):
+                values[row["metric"]].append(float(row["value"]))
     medians = [statistics.median(v) if v else 0.0 for v in values.values()]
     return (medians[0], medians[1]) if min(medians) > 0.0 else None
 
