@@ -14,13 +14,26 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = "twirl_mjx"
 
-BASE = {"types", "checks", "exits", "config", "presets", "config_json", "assets"}
+BASE = {
+    "types",
+    "checks",
+    "exits",
+    "files",
+    "array_files",
+    "config",
+    "presets",
+    "config_json",
+    "assets",
+}
 WORLD = BASE | {"sim", "motion"}
 ACTING = WORLD | {"tasks", "droq", "policies"}
 ALLOWED: dict[str, set[str]] = {
     "types": set(),
     "checks": set(),
     "exits": set(),
+    "files": {"checks"},
+    "array_files": {"files"},
+    "faults": {"exits"},
     "assets": set(),
     "config": {"types", "checks"},
     "presets": {"checks", "config"},
@@ -28,13 +41,13 @@ ALLOWED: dict[str, set[str]] = {
     "sim": BASE,
     "motion": WORLD,
     "tasks": WORLD,
-    "replay": {"types", "checks", "config"},
+    "replay": {"types", "checks", "files", "array_files", "config"},
     "droq": {"types", "checks", "config"},
     "policies": ACTING,
     "evaluation": ACTING,
     "training": ACTING | {"evaluation", "replay"},
     "deploy": ACTING | {"evaluation", "figures"},
-    "figures": set(),
+    "figures": {"checks", "files"},
     "sweep": BASE | {"training", "figures"},
     "bench": ACTING | {"evaluation", "replay", "training", "deploy", "figures"},
     "commands": ACTING

@@ -6,10 +6,19 @@ import difflib
 from collections.abc import Iterable
 
 
-def nearest(name: str, choices: Iterable[str]) -> str:
-    """Return the closest of ``choices`` to ``name``, the first one when nothing is close."""
-    listed = list(choices)
-    return (difflib.get_close_matches(name, listed, n=1, cutoff=0.0) or listed)[0]
+def nearest(value: object, choices: Iterable[object]) -> str:
+    """Return the one of ``choices`` (at least one) whose name is closest to ``value``."""
+    names = {str(name).casefold(): str(name) for name in choices}
+    close = difflib.get_close_matches(str(value).casefold(), names, n=1, cutoff=0.0)
+    return names[close[0]] if close else next(iter(names.values()))
+
+
+def choose_one(value: object, choices: Iterable[object]) -> str:
+    """Return "choose one of a, b (nearest: 'a')", the end of a refusal of ``value``."""
+    names = [str(name) for name in choices]
+    if not names:
+        return "there is none to choose"
+    return f"choose one of {', '.join(names)} (nearest: {nearest(value, names)!r})"
 
 
 def check_choice(what: str, value: str, choices: tuple[str, ...]) -> None:
@@ -19,10 +28,7 @@ def check_choice(what: str, value: str, choices: tuple[str, ...]) -> None:
         ValueError: The message lists the choices and the nearest one.
     """
     if value not in choices:
-        raise ValueError(
-            f"unknown {what} {value!r}: choose one of {', '.join(choices)}"
-            f" (nearest: {nearest(value, choices)!r})"
-        )
+        raise ValueError(f"unknown {what} {value!r}: {choose_one(value, choices)}")
 
 
 def check_range(what: str, value: float, low: float, high: float) -> None:

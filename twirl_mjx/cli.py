@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import contextlib
-import difflib
 import importlib
 import io
+import logging
 import os
 import sys
+import threading
+import traceback
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from twirl_mjx import exits
+from twirl_mjx import exits, faults
+from twirl_mjx.checks import nearest
 from twirl_mjx.deploy.gl import probe_gl
 
 COMMANDS = {
@@ -81,44 +85,81 @@ def _import_quietly(module: str) -> Any:
         return importlib.import_module(module)
 
 
-UNUSABLE_PATHS = (FileNotFoundError, IsADirectoryError, NotADirectoryError, PermissionError)
-"""What paths given by a person may lead to."""
+def _show_one_line_each(name: str) -> Callable[[], None]:
+    """Show what fails in threads and finalizers as one line, too, without tracebacks in logs.
+
+    Of finalizers only system errors are shown: what they could not write is lost.
+
+    Returns:
+        What undoes it.
+    """
+
+    def in_thread(args: threading.ExceptHookArgs) -> None:
+        if args.exc_value is not None and not isinstance(args.exc_value, SystemExit):
+            _complain(name, f"in the background: {faults.explain(args.exc_value).text}")
+
+    def in_finalizer(args: Any) -> None:
+        if isinstance(args.exc_value, OSError):
+            _complain(name, f"while closing: {faults.explain(args.exc_value).text}")
+
+    def is_new(record: logging.LogRecord) -> bool:  # what is logged with a traceback is raised, too
+        return not record.exc_info
+
+    loggers = [logging.getLogger(n) for n in ("absl", "jax._src.callback")]
+    old = threading.excepthook, sys.unraisablehook
+    threading.excepthook, sys.unraisablehook = in_thread, in_finalizer
+    for logger in loggers:
+        logger.addFilter(is_new)
+
+    def undo() -> None:
+        threading.excepthook, sys.unraisablehook = old
+        for logger in loggers:
+            logger.removeFilter(is_new)
+
+    return undo
+
+
+def _complain(name: str, text: str) -> None:
+    print(f"twirl {name}: {text}", file=sys.stderr)
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run one command.
+    """Run one command; an error is one line on stderr, with ``TWIRL_DEBUG=1`` its traceback too.
 
     Returns:
         Exit status: 0 done, else one of ``exits``.
     """
+    owns_process = argv is None
     argv = list(sys.argv[1:] if argv is None else argv)
     if not argv or argv[0] in ("-h", "--help"):
         print(_usage(), end="")
         return 0 if argv else exits.UNUSABLE
     name, *rest = argv
     if name not in COMMANDS:
-        nearest = difflib.get_close_matches(name, COMMANDS, 1, 0.0)[0]
-        print(f"twirl: unknown command {name!r} (nearest: {nearest!r})\n", file=sys.stderr)
+        close = nearest(name, COMMANDS)
+        print(f"twirl: unknown command {name!r} (nearest: {close!r})\n", file=sys.stderr)
         print(_usage(), end="", file=sys.stderr)
         return exits.UNUSABLE
+    debug = os.environ.get("TWIRL_DEBUG", "") not in ("", "0")
+    undo = (lambda: None) if debug else _show_one_line_each(name)
     try:
         _set_environment()
         if name in DRAWING:  # these parse their options before they import the simulation
             return _import_command(name).main(rest, set_up)
         os.environ.setdefault("MUJOCO_GL", "disable")
         return _import_command(name).main(rest)
-    except (ValueError, *UNUSABLE_PATHS) as error:
-        print(f"twirl {name}: {error}", file=sys.stderr)
-        return exits.UNUSABLE
-    except RuntimeError as error:
-        print(f"twirl {name}: {error}", file=sys.stderr)
-        return getattr(error, "exit_status", exits.FAILED)
     except BrokenPipeError:  # the reader of our output, `| head` say, has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return exits.UNREAD
-    except KeyboardInterrupt:
-        print(f"twirl {name}: interrupted", file=sys.stderr)
-        return exits.STOPPED
+    except (Exception, KeyboardInterrupt) as error:
+        if debug:
+            traceback.print_exception(error)
+        fault = faults.explain(error)
+        _complain(name, fault.text)
+        return fault.status
+    finally:
+        if not owns_process:  # else it holds while the interpreter ends
+            undo()
 
 
 if __name__ == "__main__":

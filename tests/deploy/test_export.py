@@ -112,9 +112,26 @@ def test_foreign_graph_with_one_row_is_run_row_by_row_and_clipped(tmp_path: Path
 
 
 def test_output_that_is_not_finite_is_refused(tmp_path: Path) -> None:
-    policy = loaded(foreign_graph(tmp_path / "f.onnx", "n", scale=float("inf")))
+    policy = loaded(foreign_graph(tmp_path / "f.onnx", "n", scale=3e38))
     with pytest.raises(ValueError, match="not finite"):
-        policy.act(np.zeros(3))
+        policy.act(np.full(3, 10.0))
+
+
+def test_graph_is_tried_when_it_is_loaded(tmp_path: Path) -> None:
+    """An infinite weight makes NaN of zeros; a reshape to other rows, a graph that breaks rows."""
+    with pytest.raises(PolicyFileError, match=r"f\.onnx: tried on zeros: .* not finite"):
+        load_policy(foreign_graph(tmp_path / "f.onnx", "n", scale=float("inf")))
+    for shape, message in (([7, 2], "the ONNX graph failed"), ([2, 3], r"made \(2, 3\) of")):
+        source = helper.make_tensor_value_info("x", TensorProto.FLOAT, ["n", 6])
+        target = helper.make_tensor_value_info("y", TensorProto.FLOAT, ["m", shape[1]])
+        to = helper.make_tensor("to", TensorProto.INT64, [2], shape)
+        node = helper.make_node("Reshape", ["x", "to"], ["y"])
+        graph = helper.make_graph([node], "g", [source], [target], [to])
+        opset = [helper.make_opsetid("", 17)]
+        path = tmp_path / "r.onnx"
+        onnx.save(helper.make_model(graph, opset_imports=opset, ir_version=8), str(path))
+        with pytest.raises(PolicyFileError, match=message):
+            load_policy(path)
 
 
 def test_files_that_are_no_graph_are_refused(tmp_path: Path) -> None:

@@ -136,7 +136,7 @@ def test_episode_bars_pool_the_runs_of_a_variant(tmp_path, write, episodes_of):
 def test_runs_can_be_set_side_by_side(icy):
     (axes,) = plots.shift_bars(icy, "return", by="run").axes
     assert len(axes.patches) == 4
-    with pytest.raises(ValueError, match="cannot draw one bar per 'seed'; "):
+    with pytest.raises(ValueError, match="cannot draw one bar per 'seed': "):
         plots.shift_bars(icy, "return", by="seed")
 
 
@@ -197,21 +197,21 @@ def test_episodes_of_an_ablation_are_not_pooled_into_bars(tmp_path, write, episo
 
 
 def test_unknown_names_are_refused_with_the_nearest(icy, tmp_path, write, rows_of):
-    with pytest.raises(TableError, match="metric 'retrun'; nearest valid: 'return'"):
+    with pytest.raises(TableError, match=r"metric 'retrun': .*nearest: 'return'"):
         plots.learning_curves(icy, "retrun")
-    with pytest.raises(ValueError, match="no theme 'drak'; nearest valid: 'dark'"):
+    with pytest.raises(ValueError, match=r"no theme 'drak': .*nearest: 'dark'"):
         plots.learning_curves(icy, "return", theme="drak")
-    with pytest.raises(ValueError, match="one line per 'varint'; nearest valid: 'variant'"):
+    with pytest.raises(ValueError, match=r"one line per 'varint': .*nearest: 'variant'"):
         plots.learning_curves(icy, "return", by="varint")
-    with pytest.raises(ValueError, match="no ablation of 'psi'; nearest valid: 'phi'"):
+    with pytest.raises(ValueError, match=r"no ablation of 'psi': .*nearest: 'phi'"):
         plots.ablation(icy, "psi", "return")
     with pytest.raises(TableError, match="no column 'phi'"):
         plots.ablation(icy, "phi", "return")
     rows = [[*r[:2], "iccy", "twril", *r[4:]] for r in rows_of("biped", "icy", "twirl", 0)]
     table = read_table(write(tmp_path / "typo.csv", tables.CURVE_COLUMNS, rows))
-    with pytest.raises(ValueError, match="no colour for variant 'twril'; nearest valid: 'twirl'"):
+    with pytest.raises(ValueError, match=r"no colour for variant 'twril': .*nearest: 'twirl'"):
         plots.learning_curves(table, "return")
-    with pytest.raises(ValueError, match=r"typo\.csv: unknown shift 'iccy'; nearest valid: 'icy'"):
+    with pytest.raises(ValueError, match=r"typo\.csv: unknown shift 'iccy': .*nearest: 'icy'"):
         plots.shift_bars(table, "return")
 
 

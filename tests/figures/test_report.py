@@ -159,7 +159,7 @@ def test_clips_alone_make_a_page_and_nothing_makes_none(tmp_path):
 
 
 def test_unusable_clips_are_refused(tmp_path):
-    with pytest.raises(MediaError, match=r"a\.mp3: cannot be shown; nearest valid: '\.mp4'"):
+    with pytest.raises(MediaError, match=r"a\.mp3: cannot be shown: .*nearest: '\.mp4'"):
         page.clip(Media(tmp_path / "a.mp3"))
     with pytest.raises(MediaError, match=r"a\.mp4: no such file"):
         page.clip(Media(tmp_path / "a.mp4"))

@@ -122,7 +122,7 @@ def test_registry() -> None:
     for policy in scripted.SCRIPTED.values():
         assert hash(policy) is not None  # usable as a static argument of jit
     assert scripted.get_scripted("trot") is scripted.SCRIPTED["trot"]
-    with pytest.raises(ValueError, match="did you mean 'bound'"):
+    with pytest.raises(ValueError, match="nearest: 'bound'"):
         scripted.get_scripted("bounds")
 
 

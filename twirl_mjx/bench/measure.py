@@ -15,6 +15,7 @@ from typing import Any, TextIO
 import jax
 import psutil
 
+from twirl_mjx import files
 from twirl_mjx.training.rundir import versions
 
 MIN_SAMPLES = 3
@@ -151,7 +152,7 @@ def machine() -> Record:
 def _processor() -> str:
     path = Path("/proc/cpuinfo")
     if path.is_file():
-        for line in path.read_text(encoding="utf-8").splitlines():
+        for line in files.read_text(path, "a list of processors").splitlines():
             if line.startswith("model name"):
                 return line.split(":", 1)[1].strip()
     return platform.processor() or platform.machine()

@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from twirl_mjx import files
 from twirl_mjx.bench.measure import Record
 
 BEGIN = "<!-- bench:begin -->"
@@ -248,4 +249,4 @@ def replace_section(page: str, section: str) -> str:
 
 def write_section(path: Path, section: str) -> None:
     """Put a text between the markers of a file."""
-    path.write_text(replace_section(path.read_text(encoding="utf-8"), section), encoding="utf-8")
+    files.write_text(path, replace_section(files.read_text(path, "a page"), section))

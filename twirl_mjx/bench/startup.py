@@ -7,7 +7,6 @@ a short warm-up and short epochs; neither changes what is compiled. It counts as
 
 from __future__ import annotations
 
-import csv
 import dataclasses
 import os
 import statistics
@@ -17,6 +16,7 @@ import tempfile
 import time
 from pathlib import Path
 
+from twirl_mjx import files
 from twirl_mjx.bench.measure import Record, machine, progress
 from twirl_mjx.checks import check_choice, check_range
 from twirl_mjx.tasks.registry import TASKS
@@ -73,9 +73,8 @@ def has_updates(path: Path) -> bool:
     """Return whether a ``metrics.csv`` has a whole row with critic updates."""
     if not path.is_file():
         return False
-    with path.open(newline="") as file:
-        steps = [row["grad_steps"] for row in csv.DictReader(file) if row["value"] is not None]
-    return any(int(number) > 0 for number in steps)
+    rows = files.read_rows(path, "the metrics of a run", {"grad_steps": int}, growing=True)
+    return any(row["grad_steps"] > 0 for row in rows)
 
 
 def start_once(options: StartupBench, cache: Path, folder: Path) -> float:
@@ -108,7 +107,7 @@ def start_once(options: StartupBench, cache: Path, folder: Path) -> float:
             while not has_updates(metrics):
                 spent = time.perf_counter() - began
                 if process.poll() is not None or spent > options.seconds:
-                    tail = log.read_text(encoding="utf-8", errors="replace")[-500:]
+                    tail = files.read_bytes(log, "a log")[-500:].decode(errors="replace")
                     raise RuntimeError(f"no critic update after {spent:.0f} s: {tail}")
                 time.sleep(POLL_S)
             return time.perf_counter() - began

@@ -15,6 +15,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from twirl_mjx import files
 from twirl_mjx.checks import check_choice, check_range
 from twirl_mjx.commands.console import json_text, parse, say
 from twirl_mjx.sweep import launch
@@ -105,12 +106,11 @@ def _all(argv: list[str]) -> int:
     from twirl_mjx.bench.measure import only_json_on_stdout
 
     options = parse(AllBench, argv, "twirl bench")
-    page = options.page.read_text(encoding="utf-8")
+    page = files.read_text(options.page, "a page with a marked section")
     report.replace_section(page, "")  # refuses a page without markers before anything is measured
     with only_json_on_stdout() as out:
         results = run_parts(options)
-        options.out.parent.mkdir(parents=True, exist_ok=True)
-        options.out.write_text(json_text(results) + "\n", encoding="utf-8")
+        files.write_json(options.out, results)
         if options.json:
             print(json_text(results), file=out, flush=True)
     parts = results["parts"]

@@ -10,6 +10,7 @@ from typing import Annotated
 import numpy as np
 import tyro
 
+from twirl_mjx import files
 from twirl_mjx.assets import asset_path
 from twirl_mjx.checks import check_choice
 from twirl_mjx.commands.console import parse, say
@@ -60,6 +61,7 @@ def main(argv: list[str], set_up: Callable[[bool], None]) -> int:
 
 def _make(argv: list[str], set_up: Callable[[bool], None]) -> int:
     options = parse(MakeOptions, argv, "twirl clip make")
+    files.check_target(options.out)
     set_up(False)
     from twirl_mjx.motion.formats import write_clip
     from twirl_mjx.motion.leap import make_leap
@@ -83,7 +85,6 @@ def _show(argv: list[str], set_up: Callable[[bool], None]) -> int:
     from twirl_mjx.sim.scene import Bands, build_scene
 
     clips = [read_clip(path) for path in options.clips or (asset_path("a1", "leap.json"),)]
-    options.out.parent.mkdir(parents=True, exist_ok=True)
     stem = options.out.parent / options.out.name
     show_lib.show(clips[0], f"{stem}.png")
     written = [f"{stem}.png"]

@@ -39,6 +39,7 @@ def main(argv: list[str], set_up: Callable[[bool], None]) -> int:
     options = parse(DemoOptions, argv, "twirl demo")
     check_range("episodes", options.episodes, 1, 100_000)
     check_range("seconds", options.seconds, *FILM_SECONDS)
+    check_range("seed", options.seed, 0, 2**32 - 1)
     folder = asset_path("policies")
     set_up(options.film)
     from twirl_mjx.tasks.registry import TASKS

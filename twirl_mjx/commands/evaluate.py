@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import dataclasses
 import sys
 import time
@@ -14,6 +13,7 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
+from twirl_mjx import files
 from twirl_mjx.checks import check_choice, check_range
 from twirl_mjx.commands.console import say
 from twirl_mjx.commands.options import Overrides, parse_in_tasks, with_overrides
@@ -80,6 +80,9 @@ def main(argv: list[str]) -> int:
     if not options.policies:
         raise ValueError("name at least one policy: a run directory, a policy file or a script")
     check_range("episodes", options.episodes, 1, 1_000_000)
+    check_range("seed", options.seed, 0, 2**32 - 1)
+    if not options.shifts:
+        raise ValueError(f"--shifts needs a condition: any of {', '.join(SHIFTS)}")
     for shift in options.shifts:
         check_choice("shift", shift, tuple(SHIFTS))
     out = options.out or Path("runs", f"evaluation-{time.strftime('%Y%m%d-%H%M%S')}.csv")
@@ -99,10 +102,11 @@ def check_outputs(out: Path, figure: Path | None) -> None:
     """Check where results go before anything is evaluated.
 
     Raises:
-        ValueError: A folder where a file is meant, or a figure that is no PNG.
+        ValueError: A folder or a device where a file is meant, or a figure that is no PNG.
     """
     if out.is_dir():
         raise ValueError(f"--out {out} is a folder (nearest: {out / 'evaluation.csv'})")
+    files.check_target(out)
     if figure is not None and (figure.is_dir() or figure.suffix != ".png"):
         raise ValueError(
             f"--figure {figure} is no PNG file (nearest: {figure.with_suffix('.png')})"
@@ -134,11 +138,7 @@ def resolve_all(options: EvaluateOptions, overrides: Overrides) -> list[Candidat
 
 def write_rows(path: Path, rows: list[list[object]]) -> None:
     """Write a table of episodes under its header, whole or not at all."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(path.name + ".partial")
-    with partial.open("w", newline="") as file:
-        csv.writer(file, lineterminator="\n").writerows([EVAL_COLUMNS, *rows])
-    partial.replace(path)
+    files.write_csv(path, [EVAL_COLUMNS, *rows])
 
 
 def _evaluate_one(candidate: Candidate, options: EvaluateOptions) -> list[list[object]]:

@@ -8,6 +8,7 @@ from typing import Annotated
 
 import tyro
 
+from twirl_mjx.checks import check_range
 from twirl_mjx.commands.console import parse, say
 from twirl_mjx.deploy.rehearsal import rehearse
 from twirl_mjx.deploy.robot import RehearsalConfig
@@ -32,6 +33,8 @@ class RehearseOptions:
 def main(argv: list[str]) -> int:
     """Rehearse and print the means."""
     options = parse(RehearseOptions, argv, "twirl rehearse")
+    check_range("episodes", options.episodes, 1, 100_000)
+    check_range("seed", options.seed, 0, 2**32 - 1)
     result = rehearse(
         options.policy,
         task=options.task,

@@ -52,6 +52,7 @@ class RenderOptions:
         """
         check_range("seconds", self.seconds, *FILM_SECONDS)
         check_range("panels", self.panels, 1, MAX_PANELS)
+        check_range("seed", self.seed, 0, 2**32 - 1)
 
 
 def main(argv: list[str], set_up: Callable[[bool], None]) -> int:
@@ -84,7 +85,6 @@ def film(config: WorldConfig, options: RenderOptions, stem: Path) -> Path:
     found = resolve_policy(options.policy, config)
     steps = min(config.episode_length, round(options.seconds / CONTROL_DT))
     recording = record_episode(config, found.policy, seed=options.seed, steps=steps)
-    stem.parent.mkdir(parents=True, exist_ok=True)
     video, strip = render_episode(
         scene_model(config, recording),
         recording.qpos,

@@ -25,6 +25,5 @@ def main(argv: list[str]) -> int:
     from twirl_mjx.figures.report import write_report
 
     options = parse(ReportOptions, argv, "twirl report")
-    options.out.parent.mkdir(parents=True, exist_ok=True)
     say(f"wrote {write_report(options.results, options.out, options.media)}")
     return 0

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from twirl_mjx import files
 from twirl_mjx.policies.learned import NumpyPolicy, hidden_layers, load_policy
 from twirl_mjx.policies.onnx_file import METADATA_KEY, load_onnx
 
@@ -101,15 +102,12 @@ def export_onnx(policy: NumpyPolicy | str | Path, out: str | Path) -> Path:
         raise ValueError(f"{policy} is already an ONNX file; copy it")
     model = build_graph(loaded)
     onnx.checker.check_model(model)
-    out.parent.mkdir(parents=True, exist_ok=True)
-    partial = out.with_name(out.name + ".partial")
-    onnx.save(model, str(partial))
-    difference = max_difference(loaded, partial)
-    if not difference <= TOLERANCE:
-        partial.unlink()
-        raise ValueError(
-            f"the exported graph differs from the policy by {difference:.2e} (allowed "
-            f"{TOLERANCE:.0e}); nothing was written to {out}"
-        )
-    partial.replace(out)
+    with files.replacing(out) as temporary:
+        onnx.save(model, str(temporary))
+        difference = max_difference(loaded, temporary)
+        if not difference <= TOLERANCE:
+            raise ValueError(
+                f"the exported graph differs from the policy by {difference:.2e} (allowed "
+                f"{TOLERANCE:.0e}); nothing was written to {out}"
+            )
     return out

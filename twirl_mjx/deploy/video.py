@@ -11,6 +11,8 @@ from typing import Any
 
 import numpy as np
 
+from twirl_mjx import files
+
 
 def overlay_text(frame: np.ndarray, lines: Sequence[str]) -> np.ndarray:
     """Return ``frame`` [H, W, 3] with lines of text on a translucent box, top left."""
@@ -62,17 +64,14 @@ def write_video(path: str | Path, frames: Iterable[np.ndarray], fps: int = 20) -
     height, width = first.shape[:2]
     if height % 2 or width % 2:
         raise ValueError(f"video frames need an even size, got {width} x {height}")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(path.stem + ".partial.mp4")
-    encoder = _start_encoder(partial, width, height, fps)
-    try:
-        _feed(encoder, itertools.chain([first], pictures))
-    except BaseException:
-        encoder.kill()
-        encoder.communicate()
-        partial.unlink(missing_ok=True)
-        raise
-    partial.replace(path)
+    with files.replacing(path) as temporary:
+        encoder = _start_encoder(temporary, width, height, fps)
+        try:
+            _feed(encoder, itertools.chain([first], pictures))
+        except BaseException:
+            encoder.kill()
+            encoder.communicate()
+            raise
     return path
 
 
@@ -125,6 +124,6 @@ def write_strip(path: str | Path, frames: Sequence[np.ndarray], gap: int = 4) ->
         raise ValueError(f"{path}: a strip needs a .png name and at least one frame")
     spacer = np.full((frames[0].shape[0], gap, 3), 255, np.uint8)
     parts = [part for frame in frames for part in (spacer, frame)][1:]
-    path.parent.mkdir(parents=True, exist_ok=True)
-    Image.fromarray(np.concatenate(parts, axis=1)).save(path, optimize=True)
+    with files.write_atomic(path) as file:
+        Image.fromarray(np.concatenate(parts, axis=1)).save(file, "png", optimize=True)
     return path

@@ -11,9 +11,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from twirl_mjx.checks import choose_one
 from twirl_mjx.figures.statistics import Interval, bootstrap, bootstrap_band, iqm, mean, std
 from twirl_mjx.figures.style import SHIFTS, TASKS, VARIANTS, canonical, metric_info
-from twirl_mjx.figures.tables import Table, TableError, mask, nearest, select
+from twirl_mjx.figures.tables import Table, TableError, mask, select
 
 STATISTICS = ("mean", "iqm", "rate")
 """What centre and bounds mean: ``mean``: mean and standard deviation (paper style); ``iqm``:
@@ -249,7 +250,7 @@ def check_statistic(statistic: str) -> str:
         ValueError: If it is not.
     """
     if statistic not in STATISTICS:
-        raise ValueError(f"no statistic '{statistic}'{nearest(statistic, STATISTICS)}")
+        raise ValueError(f"no statistic '{statistic}': {choose_one(statistic, STATISTICS)}")
     return statistic
 
 

@@ -11,6 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
+from twirl_mjx.checks import choose_one
 from twirl_mjx.figures.aggregate import (
     cell_strata,
     check_statistic,
@@ -37,7 +38,7 @@ from twirl_mjx.figures.style import (
     theme_of,
     variant_mark,
 )
-from twirl_mjx.figures.tables import Table, nearest, select, unique
+from twirl_mjx.figures.tables import Table, select, unique
 
 _ABLATIONS = ("phi", "utd")
 _BARS_BY = ("variant", "run")
@@ -97,7 +98,7 @@ def shift_bars(
     rows = metric_rows(table, metric)
     for shift in unique(rows, "shift"):
         if shift not in SHIFTS:
-            raise ValueError(f"{rows.source}: unknown shift '{shift}'{nearest(shift, SHIFTS)}")
+            raise ValueError(f"{rows.source}: unknown shift '{shift}': {choose_one(shift, SHIFTS)}")
     tasks = canonical(rows["task"].tolist(), TASKS)
     shifts = canonical(rows["shift"].tolist(), SHIFTS)
     ends = {} if rows.is_episodes else common_end(rows)
@@ -148,7 +149,7 @@ def ablation(
     """
     check_statistic(statistic)
     if column not in _ABLATIONS:
-        raise ValueError(f"no ablation of '{column}'{nearest(column, _ABLATIONS)}")
+        raise ValueError(f"no ablation of '{column}': {choose_one(column, _ABLATIONS)}")
     rows = metric_rows(table, metric)
     panels = groups(rows, ["task", "shift"])
     ends = common_end(rows)
@@ -176,7 +177,7 @@ def _run_values(strata: list[np.ndarray], statistic: str) -> np.ndarray:
 
 def _bar_marks(table: Table, by: str, theme: Theme) -> dict[str, Mark]:
     if by not in _BARS_BY:
-        raise ValueError(f"cannot draw one bar per '{by}'{nearest(by, _BARS_BY)}")
+        raise ValueError(f"cannot draw one bar per '{by}': {choose_one(by, _BARS_BY)}")
     values = canonical(table[by].tolist(), VARIANTS)
     if by == "variant":
         return {value: variant_mark(value, theme) for value in values}

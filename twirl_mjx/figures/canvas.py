@@ -18,6 +18,7 @@ from matplotlib.ticker import FuncFormatter, MaxNLocator
 from PIL import Image
 from PIL.Image import Dither, Quantize
 
+from twirl_mjx import files
 from twirl_mjx.figures.style import Theme, rc_params, short_count, theme_of
 from twirl_mjx.figures.tables import Table, note_texts
 
@@ -97,8 +98,7 @@ def svg_bytes(figure: Figure) -> bytes:
 
 def write_png(figure: Figure, path: Path) -> Path:
     """Write a figure as PNG, making the directory, and return the path."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes(png_bytes(figure))
+    files.write_bytes(path, png_bytes(figure))
     return path
 
 

@@ -9,6 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from twirl_mjx.checks import choose_one
 from twirl_mjx.figures.aggregate import (
     Series,
     check_statistic,
@@ -31,7 +32,7 @@ from twirl_mjx.figures.style import (
     ordered_mark,
     variant_mark,
 )
-from twirl_mjx.figures.tables import Table, TableError, nearest, unique
+from twirl_mjx.figures.tables import Table, TableError, unique
 
 BY = ("variant", "phi", "utd")
 """What the lines of a panel may stand for."""
@@ -137,7 +138,7 @@ def line_marks(table: Table, by: str, theme: Theme) -> dict:
         TableError: If the column is missing or empty.
     """
     if by not in BY:
-        raise ValueError(f"cannot draw one line per '{by}'{nearest(by, BY)}")
+        raise ValueError(f"cannot draw one line per '{by}': {choose_one(by, BY)}")
     if by == "variant":
         return {v: variant_mark(v, theme) for v in unique(table, "variant")}
     values = unique(table, by)

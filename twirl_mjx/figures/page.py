@@ -12,7 +12,8 @@ from dataclasses import dataclass
 from html import escape
 from pathlib import Path
 
-from twirl_mjx.figures.tables import nearest
+from twirl_mjx import files
+from twirl_mjx.checks import choose_one
 
 _VIDEO = {".mp4": "video/mp4", ".webm": "video/webm"}
 _IMAGE = {".png": "image/png", ".jpg": "image/jpeg", ".jpeg": "image/jpeg", ".gif": "image/gif"}
@@ -25,6 +26,9 @@ _SIGNATURES = {
     "image/gif": (0, b"GIF8"),
     "image/webp": (8, b"WEBP"),
 }
+
+MEDIA_LIMIT = 256 << 20
+"""Bytes, largest clip that is put into a page: browsers refuse longer addresses."""
 
 
 class MediaError(ValueError):
@@ -129,10 +133,11 @@ def clip(media: Media) -> str:
     kinds = _VIDEO | _IMAGE
     kind = kinds.get(media.path.suffix.lower())
     if kind is None:
-        raise MediaError(f"{media.path}: cannot be shown{nearest(media.path.suffix, kinds)}")
-    if not media.path.is_file():
-        raise MediaError(f"{media.path}: no such file")
-    content = media.path.read_bytes()
+        raise MediaError(f"{media.path}: cannot be shown: {choose_one(media.path.suffix, kinds)}")
+    try:
+        content = files.read_bytes(media.path, kind, MEDIA_LIMIT)
+    except (files.FileError, FileNotFoundError) as error:
+        raise MediaError(str(error)) from error
     offset, signature = _SIGNATURES[kind]
     if content[offset : offset + len(signature)] != signature:
         raise MediaError(f"{media.path}: the content is not {kind}")

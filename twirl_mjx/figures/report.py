@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from twirl_mjx import files
 from twirl_mjx.figures import page
 from twirl_mjx.figures.aggregate import groups
 from twirl_mjx.figures.canvas import png_bytes, reduced_caption
@@ -118,8 +119,7 @@ def write_report(
         f"{page.command('make figures')}.</p></footer>",
     )
     path = Path(output_path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(html, encoding="utf-8")
+    files.write_text(path, html)
     return path
 
 

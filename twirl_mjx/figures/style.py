@@ -13,7 +13,7 @@ from typing import Any
 from matplotlib import colormaps
 from matplotlib.colors import to_hex
 
-from twirl_mjx.figures.tables import nearest
+from twirl_mjx.checks import choose_one
 
 TASKS = ("stand", "biped", "imitate", "hurdles")
 """Tasks in the order of figures and tables."""
@@ -124,7 +124,7 @@ def theme_of(name: str) -> Theme:
         ValueError: If there is no such theme.
     """
     if name not in THEMES:
-        raise ValueError(f"no theme '{name}'{nearest(name, THEMES)}")
+        raise ValueError(f"no theme '{name}': {choose_one(name, THEMES)}")
     return THEMES[name]
 
 
@@ -135,7 +135,7 @@ def variant_mark(variant: str, theme: Theme) -> Mark:
         ValueError: If the variant has none.
     """
     if variant not in VARIANTS:
-        raise ValueError(f"no colour for variant '{variant}'{nearest(variant, VARIANTS)}")
+        raise ValueError(f"no colour for variant '{variant}': {choose_one(variant, VARIANTS)}")
     i = VARIANTS.index(variant)
     return Mark(theme.variants[i], _LINES[i], _MARKERS[i], _HATCHES[i])
 
@@ -207,6 +207,7 @@ def rc_params(theme: Theme) -> dict[str, Any]:
         "xtick.major.width": 0.7,
         "ytick.major.width": 0.7,
         "text.color": theme.text,
+        "text.parse_math": False,  # names in tables are shown as they are
         "figure.facecolor": theme.background,
         "figure.dpi": 100,
         "savefig.facecolor": theme.background,

@@ -13,12 +13,15 @@ the rows again).
 from __future__ import annotations
 
 import csv
-import difflib
-from collections.abc import Iterable, Mapping, Sequence
+import io
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+
+from twirl_mjx import files
+from twirl_mjx.checks import choose_one
 
 CURVE_COLUMNS = (
     "run",
@@ -91,21 +94,13 @@ class Table:
     def __getitem__(self, column: str) -> np.ndarray:
         if column not in self.columns:
             known = list(self.columns)
-            raise TableError(f"{self.source}: no column '{column}'{nearest(column, known)}")
+            raise TableError(f"{self.source}: no column '{column}': {choose_one(column, known)}")
         return self.columns[column]
 
     @property
     def is_episodes(self) -> bool:
         """Whether a row is an evaluated episode (otherwise a moment of training)."""
         return "episode" in self.columns
-
-
-def nearest(value: object, known: Iterable[object]) -> str:
-    """Return "; nearest valid: ..." for an error message, with every choice if none is close."""
-    names = [str(name) for name in known]
-    close = difflib.get_close_matches(str(value), names, n=1, cutoff=0.4)
-    listing = ", ".join(names) if names else "none"
-    return f"; nearest valid: '{close[0]}' (of {listing})" if close else f"; valid: {listing}"
 
 
 def read_table(path: str | Path) -> Table:
@@ -124,14 +119,16 @@ def read_table(path: str | Path) -> Table:
             a row has another number of cells, or a cell is not the number it should be.
     """
     path = Path(path)
-    if not path.is_file():
-        raise TableError(f"{path}: no such file")
-    with path.open(newline="", encoding="utf-8") as handle:
-        lines = handle.readlines()
     notes = []
-    while lines and lines[0].startswith("#"):
-        notes.append(_parse_note(path.stem, lines.pop(0)))
-    rows = list(csv.reader(lines))
+    try:
+        text = files.read_text(path, "a result table")
+        lines = io.StringIO(text, newline="").readlines()
+        while lines and lines[0].startswith("#"):
+            notes.append(_parse_note(path.stem, lines.pop(0)))
+        rows = list(csv.reader(lines))
+    except (csv.Error, files.FileError, FileNotFoundError) as error:
+        message = str(error)
+        raise TableError(message if str(path) in message else f"{path}: {message}") from error
     if not rows:
         raise TableError(f"{path}: empty file, expected the header {','.join(CURVE_COLUMNS)}")
     header = _check_header(path, rows[0])
@@ -238,7 +235,8 @@ def select(table: Table, **equals: object) -> Table:
         hits = table[name] == value
         if not hits.any():
             known = unique(table, name)
-            raise TableError(f"{table.source}: no row with {name} '{value}'{nearest(value, known)}")
+            advice = choose_one(value, known)
+            raise TableError(f"{table.source}: no row with {name} '{value}': {advice}")
         rows &= hits
     return mask(table, rows)
 
@@ -272,7 +270,7 @@ def _check_header(path: Path, cells: Sequence[str]) -> list[str]:
     known = (*required, *OPTIONAL_COLUMNS)
     for name in header:
         if name not in known:
-            raise TableError(f"{path}:header: unknown column '{name}'{nearest(name, known)}")
+            raise TableError(f"{path}:header: unknown column '{name}': {choose_one(name, known)}")
         if header.count(name) > 1:
             raise TableError(f"{path}:header: column '{name}' appears {header.count(name)} times")
     for name in required:
@@ -292,7 +290,7 @@ def _convert(path: Path, name: str, cells: list[str], lines: list[int]) -> np.nd
         values = np.array([_number(path, name, *pair) for pair in zip(cells, lines, strict=True)])
     wrong = np.isinf(values)
     if name in _COUNTS:
-        wrong |= ~((values >= 0) & (values == np.floor(values)))
+        wrong |= ~((values >= 0) & (values <= 2**53) & (values == np.floor(values)))
     if wrong.any():
         i = int(np.argmax(wrong))
         wanted = "a whole number >= 0" if name in _COUNTS else "a finite number"

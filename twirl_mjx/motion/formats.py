@@ -24,6 +24,7 @@ from typing import Any, Literal
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from twirl_mjx import files
 from twirl_mjx.motion.clip import Clip, LoopMode, frame_velocities
 from twirl_mjx.sim import a1, kinematics
 
@@ -69,13 +70,7 @@ def read_clip(path: str | Path, legs: Sequence[str] = a1.LEGS) -> Clip:
 
 
 def _parse(path: Path) -> dict[str, Any]:
-    try:
-        data = json.loads(path.read_text(encoding="utf-8"))
-    except json.JSONDecodeError as error:
-        where = f"line {error.lineno}, column {error.colno}"
-        raise ValueError(f"{path}: {where}: not JSON: {error.msg}") from error
-    except UnicodeDecodeError as error:
-        raise ValueError(f"{path}: byte {error.start}: not UTF-8 text") from error
+    data = files.read_json(path, "a clip")
     if not isinstance(data, dict):
         raise ValueError(f"{path}: line 1: need a JSON object, got {type(data).__name__}")
     return data
@@ -136,7 +131,7 @@ def write_clip(clip: Clip, path: str | Path, layout: Layout = "peng") -> None:
 
     Args:
         clip: The motion.
-        path: File to write; its folder must exist.
+        path: File to write.
         layout: ``peng`` (small) or ``amp``.
 
     Raises:
@@ -157,7 +152,7 @@ def write_clip(clip: Clip, path: str | Path, layout: Layout = "peng") -> None:
     frames = [json.dumps([round(float(v), 6) + 0.0 for v in row]) for row in rows]
     body = ",\n".join(f"  {frame}" for frame in frames)
     text = "{\n" + "\n".join(lines) + '\n"Frames": [\n' + body + "\n]\n}\n"
-    Path(path).write_text(text, encoding="utf-8")
+    files.write_text(path, text)
 
 
 def _derived(clip: Clip) -> np.ndarray:

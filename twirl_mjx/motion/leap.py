@@ -15,6 +15,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
+from twirl_mjx import files
 from twirl_mjx.assets import asset_path
 from twirl_mjx.motion.clip import Clip
 from twirl_mjx.motion.leap_config import LeapConfig
@@ -59,7 +60,7 @@ def make_leap(
 def shipped_plan(layout: Layout) -> np.ndarray | None:
     """Return the shipped plan [P], or None if it has other variables than ``layout``."""
     path = asset_path(*SHIPPED_PLAN)
-    numbers = json.loads(path.read_text(encoding="utf-8"))
+    numbers = files.read_json(path, "the plan of a leap")
     sizes = {name: place.stop - place.start for name, place in layout.index.items()}
     if {name: len(values) for name, values in numbers.items()} != sizes:
         return None
@@ -73,7 +74,7 @@ def write_plan(layout: Layout, params: np.ndarray, path: str | Path) -> None:
     """Write the numbers [P] of a plan by name, for ``shipped_plan``."""
     rows = {name: params[place].round(9).tolist() for name, place in layout.index.items()}
     lines = ",\n".join(f"{json.dumps(name)}: {json.dumps(row)}" for name, row in rows.items())
-    Path(path).write_text("{\n" + lines + "\n}\n", encoding="utf-8")
+    files.write_text(path, "{\n" + lines + "\n}\n")
 
 
 def motion_to_clip(motion: LeapMotion, duration: float, name: str) -> Clip:

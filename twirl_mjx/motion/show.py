@@ -9,8 +9,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import matplotlib.figure
+import matplotlib.text
 import numpy as np
 
+from twirl_mjx import files
 from twirl_mjx.motion.clip import Clip, headings
 from twirl_mjx.motion.formats import foot_paths
 from twirl_mjx.sim import a1
@@ -86,7 +88,7 @@ def show(clip: Clip, path: str | Path) -> None:
         f"{flight[:-1].sum() * clip.frame_duration:.2f} s of it airborne",
         loc="left",
     )
-    figure.savefig(path, dpi=150)
+    _save(figure, Path(path))
 
 
 def compare(clips: Sequence[Clip], path: str | Path, source: str = "") -> None:
@@ -122,4 +124,13 @@ def compare(clips: Sequence[Clip], path: str | Path, source: str = "") -> None:
     )
     for axis in axes:
         axis.spines[["top", "right"]].set_visible(False)
-    figure.savefig(path, dpi=150)
+    _save(figure, Path(path))
+
+
+def _save(figure: matplotlib.figure.Figure, path: Path) -> None:
+    """Write a figure, whole or not at all; names of clips are shown as they are."""
+    for text in figure.findobj(matplotlib.text.Text):
+        text.set_parse_math(False)
+        text.set_text(text.get_text().encode(errors="replace").decode())
+    with files.write_atomic(path) as file:
+        figure.savefig(file, format=path.suffix.removeprefix(".") or "png", dpi=150)

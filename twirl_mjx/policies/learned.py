@@ -8,15 +8,14 @@ loading imports neither jax nor a simulator, so a file runs on a robot's compute
 from __future__ import annotations
 
 import dataclasses
-import io
 import json
-import zipfile
-import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+
+from twirl_mjx import array_files, files
 
 if TYPE_CHECKING:
     from twirl_mjx.policies.onnx_file import OnnxPolicy
@@ -25,6 +24,8 @@ FORMAT = "twirl_mjx policy"
 FORMAT_VERSION = 1
 BEST_POLICY = "policy.npz"
 LAST_POLICY = "policy_last.npz"
+LIMIT = 1 << 30
+"""Bytes, largest policy that is read; the paper's networks have half a million."""
 
 Params = dict[str, dict[str, np.ndarray]]
 """Actor parameters: layer name to ``kernel`` [in, out] and ``bias`` [out]."""
@@ -100,7 +101,7 @@ class PolicyHeader:
         """
         try:
             record = json.loads(text)
-        except json.JSONDecodeError as error:
+        except (ValueError, RecursionError) as error:
             raise PolicyFileError(f"the header is not JSON: {error}") from error
         if not isinstance(record, dict) or record.pop("format", None) != FORMAT:
             raise PolicyFileError(f"the header is not marked as {FORMAT!r}")
@@ -112,7 +113,9 @@ class PolicyHeader:
             )
         try:
             return cls(**record)
-        except TypeError as error:
+        except PolicyFileError:
+            raise
+        except (TypeError, ValueError, OverflowError) as error:
             raise PolicyFileError(f"the header has wrong fields: {error}") from error
 
     def component(self, index: int) -> str:
@@ -254,25 +257,16 @@ def save_policy(
     params = _as_params(actor_params)
     check_params(params, header.observation_size, header.action_size)
     arrays = {f"{la}/{n}": v for la, values in params.items() for n, v in sorted(values.items())}
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(path.name + ".partial")
-    with partial.open("wb") as file:
-        np.savez_compressed(file, allow_pickle=False, header=np.array(header.to_json()), **arrays)
-    partial.replace(path)
+    array_files.write_npz(path, {"header": np.array(header.to_json())} | arrays, compressed=True)
     return path
 
 
 def _read_npz(path: Path) -> NumpyPolicy:
     """Read one policy file; every failure becomes a ``PolicyFileError`` with the reason."""
     try:
-        archive = np.load(io.BytesIO(path.read_bytes()), allow_pickle=False)
-        if isinstance(archive, np.ndarray):
-            raise PolicyFileError(f"{path} holds one array, not a policy archive")
-        arrays = {name: archive[name] for name in archive.files}
-    except PolicyFileError:
-        raise
-    except (zipfile.BadZipFile, zlib.error, EOFError, OSError, ValueError, KeyError) as error:
-        raise PolicyFileError(f"{path} is not a readable .npz archive: {error}") from error
+        arrays = array_files.read_npz(path, "a policy", LIMIT)
+    except files.FileError as error:
+        raise PolicyFileError(str(error)) from error
     text = arrays.pop("header", None)
     if text is None or text.dtype.kind != "U":
         raise PolicyFileError(f"{path} is not a policy: no header among {sorted(arrays)[:8]}")
@@ -284,7 +278,7 @@ def _read_npz(path: Path) -> NumpyPolicy:
         header = PolicyHeader.from_json(str(text))
         params = _as_params(params)
         check_params(params, header.observation_size, header.action_size)
-    except PolicyFileError as error:
+    except (TypeError, ValueError) as error:
         raise PolicyFileError(f"{path}: {error}") from error
     return NumpyPolicy(header, params)
 
@@ -296,7 +290,7 @@ def resolve_policy_path(path: str | Path) -> Path:
         FileNotFoundError: nothing to load there; the message lists what is and how to make it.
     """
     path = Path(path)
-    if path.is_file():
+    if path.exists() and not path.is_dir():
         return path
     if not path.exists():
         raise FileNotFoundError(

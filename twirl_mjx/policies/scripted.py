@@ -9,7 +9,6 @@ of the filter is the wanted joint path itself, without lag.
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import functools
 from typing import Any
 
@@ -17,6 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from twirl_mjx.checks import check_choice
 from twirl_mjx.sim import a1, kinematics
 from twirl_mjx.sim.actuation import BUTTER_A, BUTTER_B
 from twirl_mjx.types import SourcePolicy
@@ -215,10 +215,5 @@ def get_scripted(name: str) -> SourcePolicy:
     Raises:
         ValueError: unknown name; the message gives the closest one.
     """
-    if name in SCRIPTED:
-        return SCRIPTED[name]
-    closest = difflib.get_close_matches(name, SCRIPTED, 1, 0.0)
-    raise ValueError(
-        f"no scripted policy {name!r}; did you mean {closest[0]!r}? There are: "
-        + ", ".join(sorted(SCRIPTED))
-    )
+    check_choice("scripted policy", name, tuple(SCRIPTED))
+    return SCRIPTED[name]

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import zipfile
-import zlib
 from pathlib import Path
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 
+from twirl_mjx import array_files, files
 from twirl_mjx.types import Transition
 
 FORMAT = "twirl-source-dataset"
@@ -55,13 +54,9 @@ def write(path: Path, header: DatasetHeader, data: Transition) -> None:
         header: Its description.
         data: Transitions [n, ...] as arrays.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(path.name + ".partial")
     text = json.dumps(dataclasses.asdict(header), sort_keys=True)
     arrays: dict[str, Any] = {name: np.asarray(getattr(data, name)) for name in FIELDS}
-    with partial.open("wb") as file:
-        np.savez(file, allow_pickle=False, header=np.array(text), **arrays)
-    partial.replace(path)
+    array_files.write_npz(path, {"header": np.array(text)} | arrays)
 
 
 def read(
@@ -73,7 +68,7 @@ def read(
         FileNotFoundError: No such file.
         DatasetError: Unreadable, of another version or task, of wrong sizes, or not finite.
     """
-    if not path.is_file():
+    if not path.exists():
         raise FileNotFoundError(f"no source dataset at {path}; `twirl collect` makes one")
     header, arrays = _load(path)
     for what, found, need in (
@@ -94,6 +89,8 @@ def read(
         if name not in arrays or arrays[name].shape != shape:
             found = arrays[name].shape if name in arrays else "nothing"
             raise DatasetError(f"{path}: {name} has shape {found}, the header says {shape}")
+        if arrays[name].dtype.kind not in "fb":
+            raise DatasetError(f"{path}: {name} is of type {arrays[name].dtype}, need numbers")
         bad = ~np.isfinite(arrays[name]).reshape(header.size, -1).all(axis=1)
         if bad.any():
             raise DatasetError(f"{path}: {name} is not finite in row {int(np.argmax(bad))}")
@@ -103,19 +100,16 @@ def read(
 
 
 def _load(path: Path) -> tuple[DatasetHeader, dict[str, np.ndarray]]:
+    remedy = "remove it and collect again"
     try:
-        with path.open("rb") as file:
-            archive = np.load(file, allow_pickle=False)
-            if isinstance(archive, np.ndarray):
-                raise ValueError("it holds one array, not an archive")
-            arrays = {name: archive[name] for name in archive.files}
+        arrays = array_files.read_npz(path, "a source dataset", remedy=remedy)
         record = json.loads(str(arrays.pop("header")))
-        if not isinstance(record, dict):
-            raise ValueError(f"its header is {record!r}, not a JSON object")
-    except (zipfile.BadZipFile, zlib.error, EOFError, OSError, ValueError, KeyError) as error:
-        raise DatasetError(
-            f"{path} is not a readable source dataset: {error}; remove it and collect again"
-        ) from error
+    except files.FileError as error:
+        raise DatasetError(str(error)) from error
+    except (ValueError, KeyError, RecursionError) as error:
+        raise DatasetError(f"{path}: no header that can be read: {error}; {remedy}") from error
+    if not isinstance(record, dict):
+        raise DatasetError(f"{path}: its header is {record!r}, not a JSON object; {remedy}")
     if record.get("format") != FORMAT or record.get("version") != VERSION:
         raise DatasetError(
             f"{path} is {record.get('format')!r} version {record.get('version')}, this program"

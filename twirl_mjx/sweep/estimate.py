@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+from twirl_mjx import files
 from twirl_mjx.sweep.plan import Cell, reached_steps
 from twirl_mjx.training.config import TrainConfig
 from twirl_mjx.training.rundir import RunDir
@@ -50,10 +51,9 @@ def measure(runs: Path) -> list[Speed]:
     speeds = []
     for path in sorted(runs.glob("*/metrics.csv")):
         try:
-            config = RunDir(path.parent).read_config()
-        except (FileNotFoundError, ValueError):
+            config, rates = RunDir(path.parent).read_config(), _rates(path)
+        except (FileNotFoundError, ValueError, KeyError, csv.Error):
             continue  # not a run of this version: it tells nothing about these
-        rates = _rates(path)
         if rates is not None:
             speeds.append(Speed(_learner(config), _setting(config), *rates))
     return speeds
@@ -62,16 +62,16 @@ def measure(runs: Path) -> list[Speed]:
 def _rates(path: Path) -> tuple[float, float] | None:
     """Return the median transitions and updates per second of the whole rows of a run."""
     values: dict[str, list[float]] = {"env_steps_per_s": [], "updates_per_s": []}
-    with path.open(newline="") as file:
-        rows = csv.reader(line for line in file if line.endswith("\n"))
-        header = next(rows, [])
-        for cells in rows:
-            if len(cells) != len(header):
-                continue  # cut off by a kill, or being written
-            row = dict(zip(header, cells, strict=True))
-            if row.get("metric") in values and row["grad_steps"] not in ("", "0"):
-                with contextlib.suppress(ValueError):
-                    values[row["metric"]].append(float(row["value"]))
+    lines = files.read_text(path, "the metrics of a run").splitlines(keepends=True)
+    rows = csv.reader(line for line in lines if line.endswith("\n"))
+    header = next(rows, [])
+    for cells in rows:
+        if len(cells) != len(header):
+            continue  # cut off by a kill, or being written
+        row = dict(zip(header, cells, strict=True))
+        if row.get("metric") in values and row["grad_steps"] not in ("", "0"):
+            with contextlib.suppress(ValueError):
+                values[row["metric"]].append(float(row["value"]))
     medians = [statistics.median(v) if v else 0.0 for v in values.values()]
     return (medians[0], medians[1]) if min(medians) > 0.0 else None
 

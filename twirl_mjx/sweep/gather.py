@@ -6,11 +6,10 @@ with comment lines that say what was reduced and which command makes the rows ag
 
 from __future__ import annotations
 
-import csv
-import io
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
+from twirl_mjx import files
 from twirl_mjx.figures.style import METRICS
 from twirl_mjx.figures.tables import CURVE_COLUMNS, EPISODE_COLUMNS
 from twirl_mjx.sweep.grid import Grid
@@ -24,6 +23,12 @@ SETTING_COLUMNS = {"phi": "replay.phi", "utd": "droq.utd"}
 """Column -> config field; a table has the columns whose field varies in the grid."""
 
 Row = dict[str, str]
+
+
+def cells_of(columns: Sequence[str]) -> dict[str, Callable[[str], str]]:
+    """Return the check of every column of a run's table: numbers keep their digits."""
+    numbers = ("env_steps", "grad_steps", "wall_s", "value")
+    return {name: files.number_text if name in numbers else str for name in columns}
 
 
 def gather(grid: Grid, cells: Sequence[Cell], runs: Path, results: Path) -> list[Path]:
@@ -83,7 +88,7 @@ def stale_tables(folder: Path, grid: Grid, arms: set[str]) -> list[Path]:
     mark = f"# grid: {grid.results_name}"
     stale = []
     for path in sorted(folder.glob("*.csv")):
-        notes = path.read_text(encoding="utf-8")[:2000].splitlines()
+        notes = files.read_text(path, "a result table")[:2000].splitlines()
         arm = path.name.removesuffix(".csv").removesuffix(".episodes")
         if mark in notes and (arm not in arms or not expected.issubset(notes)):
             stale.append(path)
@@ -96,11 +101,10 @@ def curve_rows(cell: Cell, runs: Path, columns: Sequence[str]) -> list[Row]:
     if cell.config.variant == "zero-shot" or not path.is_file():
         return _untrained_rows(cell, runs, columns)
     series: dict[str, list[Row]] = {}
-    with path.open(newline="") as file:
-        for row in csv.DictReader(file):
-            name = row["metric"]
-            if name.removeprefix(EVALUATION) in METRICS:
-                series.setdefault(name, []).append(row | _settings(cell, columns))
+    for row in files.read_rows(path, "the metrics of a run", cells_of(CURVE_COLUMNS)):
+        name = row["metric"]
+        if name.removeprefix(EVALUATION) in METRICS:
+            series.setdefault(name, []).append(row | _settings(cell, columns))
     return [row for rows in series.values() for row in thin(rows)]
 
 
@@ -119,12 +123,9 @@ def _untrained_rows(cell: Cell, runs: Path, columns: Sequence[str]) -> list[Row]
 
 def episode_rows(cell: Cell, runs: Path, columns: Sequence[str]) -> list[Row]:
     """Return the main metrics of every episode of a run's final evaluation."""
-    with RunDir(runs / cell.name).episodes.open(newline="") as file:
-        return [
-            row | _settings(cell, columns)
-            for row in csv.DictReader(file)
-            if row["metric"] in METRICS
-        ]
+    path = RunDir(runs / cell.name).episodes
+    rows = files.read_rows(path, "the evaluation of a run", cells_of(EPISODE_COLUMNS))
+    return [row | _settings(cell, columns) for row in rows if row["metric"] in METRICS]
 
 
 def _settings(cell: Cell, columns: Sequence[str]) -> Row:
@@ -145,16 +146,9 @@ def write_table(
     path: Path, notes: Sequence[str], columns: Sequence[str], rows: Sequence[Row]
 ) -> None:
     """Write comment lines and rows, whole or not at all; numbers with six digits."""
-    text = io.StringIO()
-    text.write("".join(f"{line}\n" for line in notes))
-    writer = csv.DictWriter(text, columns, lineterminator="\n", extrasaction="ignore")
-    writer.writeheader()
-    for row in rows:
-        short = {"value": f"{float(row['value']):.6g}"}
-        if "wall_s" in row:
-            short["wall_s"] = f"{float(row['wall_s']):.1f}"
-        writer.writerow(row | short)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(path.name + ".partial")
-    partial.write_text(text.getvalue(), encoding="utf-8")
-    partial.replace(path)
+    digits = {"value": ".6g", "wall_s": ".1f"}
+    cells = [
+        [format(float(row[c]), digits[c]) if c in digits else row.get(c, "") for c in columns]
+        for row in rows
+    ]
+    files.write_csv(path, [columns, *cells], notes="".join(f"{line}\n" for line in notes))

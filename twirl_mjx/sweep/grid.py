@@ -117,7 +117,10 @@ def _module(path: Path) -> ModuleType:
     spec = importlib.util.spec_from_file_location(f"_twirl_grid_{path.stem}", path)
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
+    try:
+        spec.loader.exec_module(module)
+    except Exception as error:
+        raise ValueError(f"{path}: no grid: {type(error).__name__}: {error}") from error
     return module
 
 

@@ -8,13 +8,13 @@ grid, preset or source never continues or counts the run of another.
 
 from __future__ import annotations
 
-import csv
 import dataclasses
 import hashlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Literal
 
+from twirl_mjx import files
 from twirl_mjx.sweep.grid import Draft, Grid, configure
 from twirl_mjx.training import config_json, rundir, source_rules
 from twirl_mjx.training.config import TrainConfig
@@ -170,9 +170,8 @@ def _identity_of_path(path: Path) -> str:
     if path.is_dir():
         steps = evaluated_steps(path)
         return f"{path.name} {rundir.digest(RunDir(path).read_config())} at {steps}"
-    if not path.is_file():
-        raise FileNotFoundError(f"no source policy {path}")
-    return f"{path.name} {hashlib.sha256(path.read_bytes()).hexdigest()[:12]}"
+    content = files.read_bytes(path, "a source policy")
+    return f"{path.name} {hashlib.sha256(content).hexdigest()[:12]}"
 
 
 def run_name(config: TrainConfig) -> str:
@@ -187,9 +186,8 @@ def evaluated_steps(run_dir: Path) -> int | None:
     path = RunDir(run_dir).episodes
     if not path.is_file():
         return None
-    with path.open(newline="") as file:
-        row = next(csv.DictReader(file), None)
-    return None if row is None else int(row["env_steps"])
+    rows = files.read_rows(path, "the evaluation of a run", {"env_steps": int})
+    return rows[0]["env_steps"] if rows else None
 
 
 def reached_steps(run_dir: Path) -> int:
@@ -197,11 +195,8 @@ def reached_steps(run_dir: Path) -> int:
     path = RunDir(run_dir).metrics
     if not path.is_file():
         return 0
-    with path.open("rb") as file:
-        file.seek(0, 2)
-        file.seek(max(0, file.tell() - 4096))
-        lines = file.read().decode(errors="replace").splitlines(keepends=True)
-    for line in reversed(lines):
+    tail = files.read_tail(path, "the metrics of a run", 4096)
+    for line in reversed(tail.decode(errors="replace").splitlines(keepends=True)):
         cells = line.split(",")
         if line.endswith("\n") and len(cells) == 10 and cells[6].isdigit():
             return int(cells[6])

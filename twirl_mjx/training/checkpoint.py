@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 import orbax.checkpoint as ocp
 
+from twirl_mjx import array_files
 from twirl_mjx.training.state import TrainState
 
 KEEP = 2
@@ -107,6 +108,17 @@ class Checkpoints:
         step = int(state.env_steps)
         if step in self._manager.all_steps():
             return
+        kept = self.latest()
+        try:
+            self._write(step, state, progress)
+        except Exception as error:
+            at = "no checkpoint yet" if kept is None else f"the checkpoint at {kept:,} transitions"
+            error.add_note(f"saved: {at}")
+            raise
+        self._prune(state)
+
+    def _write(self, step: int, state: TrainState, progress: dict[str, Any]) -> None:
+        """Write the rows, then the rest."""
         self._append_rows(state)
         bare = state.replace(replay=state.replay.replace(source=None, online=_bare(state)))
         self._manager.save(
@@ -118,7 +130,6 @@ class Checkpoints:
             ),
         )
         self._manager.wait_until_finished()
-        self._prune(state)
 
     def restore(self, template: TrainState) -> tuple[TrainState, dict[str, Any]]:
         """Return the newest checkpoint as a state shaped like ``template``, and its progress.
@@ -163,10 +174,7 @@ class Checkpoints:
             return
         rows = np.asarray(state.replay.online.rows)[np.arange(first, total) % capacity]
         target = self._replay / f"rows_{first:012d}_{total:012d}.npy"
-        partial = target.with_suffix(".partial")
-        with partial.open("wb") as file:
-            np.save(file, rows)
-        partial.replace(target)
+        array_files.write_npy(target, rows)
 
     def _logged(self, step: int) -> int:
         """Return how many rows had been inserted at a checkpoint."""
@@ -217,7 +225,7 @@ def _stored_rows(folder: Path, begin: int, end: int) -> Iterator[tuple[int, np.n
             continue
         if first > have:
             break
-        part = np.load(path)[have - first : end - first]
+        part = array_files.read_npy(path, "rows of a replay log")[have - first : end - first]
         yield have, part
         have += len(part)
     if have < end:

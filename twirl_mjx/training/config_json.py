@@ -58,14 +58,17 @@ def from_json(text: str) -> TrainConfig:
     Raises:
         ValueError: The text is not JSON, or holds an unknown key or a bad value.
     """
-    record = json.loads(text)
-    return from_dict(_from_version_0_1(record) if is_version_0_1(text) else record)
+    return from_record(json.loads(text))
 
 
-def is_version_0_1(text: str) -> bool:
-    """Return whether a config was written by version 0.1, which kept ``env`` apart."""
-    record = json.loads(text)
-    return isinstance(record, dict) and "env" in record
+def from_record(record: Any) -> TrainConfig:
+    """Return the config in a parsed JSON document of this version or of 0.1.
+
+    Raises:
+        ValueError: As :func:`from_json`.
+    """
+    is_old = isinstance(record, dict) and "env" in record
+    return from_dict(_from_version_0_1(record) if is_old else record)
 
 
 def from_dict(record: Any) -> TrainConfig:

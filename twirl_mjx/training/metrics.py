@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import csv
-import difflib
 import math
 import os
 import time
@@ -15,6 +14,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from rich.console import Console
 
+from twirl_mjx import files
+from twirl_mjx.checks import nearest
 from twirl_mjx.training.progress import ProgressView, Snapshot
 
 COLUMNS = (
@@ -118,10 +119,10 @@ def describe(name: str) -> MetricInfo:
     for prefix, info in FAMILIES.items():
         if name.startswith(prefix) and len(name) > len(prefix):
             return info
-    closest = difflib.get_close_matches(name, [*METRICS, *FAMILIES], 1, 0.0)[0]
+    closest = nearest(name, [*METRICS, *FAMILIES])
     raise ValueError(
-        f"unknown metric {name!r}; the closest known name is {closest!r}. New names belong in "
-        f"METRICS, or under one of {', '.join(FAMILIES)}"
+        f"unknown metric {name!r} (nearest: {closest!r}). New names belong in METRICS, or under"
+        f" one of {', '.join(FAMILIES)}"
     )
 
 
@@ -145,19 +146,17 @@ def truncate_csv(path: Path, env_steps: int) -> float:
         ``wall_s`` of the last row kept, 0 without rows.
 
     Raises:
-        ValueError: the file has other columns.
+        ValueError: the file has other columns, or a damaged row before its last.
     """
-    text = path.read_text()
-    text = text[: text.rfind("\n") + 1]  # a row without its line end was being written
-    rows = list(csv.reader(text.splitlines()))
+    what = f"a metrics table with columns {','.join(COLUMNS)}"
+    rows = files.read_rows(
+        path, what, {"env_steps": int, "wall_s": files.number_text}, growing=True
+    )
     if rows and tuple(rows[0]) != COLUMNS:
-        raise ValueError(f"{path} has columns {rows[0]}, expected {list(COLUMNS)}")
-    kept = [row for row in rows[1:] if len(row) == len(COLUMNS) and int(row[6]) <= env_steps]
-    partial = path.with_name(path.name + ".partial")
-    with partial.open("w", newline="") as file:
-        csv.writer(file, lineterminator="\n").writerows([COLUMNS, *kept])
-    partial.replace(path)
-    return float(kept[-1][8]) if kept else 0.0
+        raise ValueError(f"{path} has columns {list(rows[0])}, expected {list(COLUMNS)}")
+    kept = [row for row in rows if row["env_steps"] <= env_steps]
+    files.write_csv(path, [COLUMNS, *(list(row.values()) for row in kept)])
+    return float(kept[-1]["wall_s"]) if kept else 0.0
 
 
 class RunLogger:

@@ -8,7 +8,6 @@ shift the source is a finished nominal run of the same task, and its replay is t
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import hashlib
 import json
 from collections.abc import Callable
@@ -19,6 +18,7 @@ import jax
 import jax.numpy as jnp
 
 from twirl_mjx import exits, records
+from twirl_mjx.checks import choose_one
 from twirl_mjx.droq.state import DroqState
 from twirl_mjx.policies.resolve import SCRIPTED_SOURCES, Source, resolve_policy
 from twirl_mjx.replay import dataset, ring
@@ -180,11 +180,7 @@ def no_such_source(path: Path, runs_dir: Path) -> str:
     """Return what can be given instead of a source that does not exist."""
     runs = sorted(str(found.parent) for found in runs_dir.glob("*/policy.npz"))
     choices = [*SCRIPTED_SOURCES, *runs]
-    nearest = difflib.get_close_matches(str(path), choices, n=1, cutoff=0.0)[0]
-    return (
-        f"there is no source {path}: give a policy file, or one of {', '.join(choices)}"
-        f" (nearest: {nearest})"
-    )
+    return f"there is no source {path}: give a policy file, or {choose_one(path.name, choices)}"
 
 
 def _nominal_run(config: TrainConfig, preset: str, runs_dir: Path) -> RunDir:

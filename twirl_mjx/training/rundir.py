@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import csv
 import dataclasses
 import fcntl
 import functools
@@ -19,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from twirl_mjx import exits
+from twirl_mjx import exits, files
 from twirl_mjx.policies.learned import BEST_POLICY, LAST_POLICY
 from twirl_mjx.tasks.measures import episode_means
 from twirl_mjx.training import config_json
@@ -36,6 +35,8 @@ so far. (``source`` is judged by its digest.)"""
 EVAL_COLUMNS = (
     "run", "task", "shift", "variant", "seed", "env_steps", "episode", "metric", "value",
 )  # fmt: skip
+EVAL_CELLS = {"env_steps": int, "metric": str, "value": float}
+"""Columns that are read back, with what turns their cells into values."""
 
 
 class RunMismatchError(ValueError):
@@ -183,14 +184,10 @@ class RunDir:
 
     def _differences(self, config: TrainConfig, source: dict[str, str] | None) -> list[str]:
         """Return what differs between the run that is there and one that is meant."""
-        text = self.config.read_text()
-        old = config_json.from_json(text)
-        free = may_change(config)
+        old, free = self.read_config(), may_change(config)
         lines = [li for li in config_json.diff(old, config) if not li.startswith(free)]
         known = self.read_source()
-        # Version 0.1 computed digests over other names: there the origin has to do.
-        part = "origin" if config_json.is_version_0_1(text) else "digest"
-        if source and known and known[part] != source[part]:
+        if source and known and known["digest"] != source["digest"]:
             lines += [f"source {key}: {known[key]!r} -> {source[key]!r}" for key in source]
         return lines
 
@@ -200,19 +197,18 @@ class RunDir:
             return None
         values: dict[str, list[float]] = {}
         env_steps = 0
-        with self.episodes.open(newline="") as file:
-            for row in csv.DictReader(file):
-                env_steps = int(row["env_steps"])
-                values.setdefault(row["metric"], []).append(float(row["value"]))
+        for row in files.read_rows(self.episodes, "the evaluation of a run", EVAL_CELLS):
+            env_steps = row["env_steps"]
+            values.setdefault(row["metric"], []).append(row["value"])
         return Finished(env_steps, episode_means({k: np.array(v) for k, v in values.items()}))
 
     def open(self, config: TrainConfig, source: dict[str, str] | None = None) -> None:
         """Write down config, source and versions of the part of the run that follows."""
         self.path.mkdir(parents=True, exist_ok=True)
-        _write(self.config, config_json.to_json(config))
+        files.write_text(self.config, config_json.to_json(config))
         if source:
-            _write(self.source, json.dumps(source, indent=2, sort_keys=True) + "\n")
-        _write(self.versions, json.dumps(versions(), indent=2, sort_keys=True) + "\n")
+            files.write_json(self.source, source)
+        files.write_json(self.versions, versions())
 
     def read_config(self) -> TrainConfig:
         """Return the config of the run.
@@ -227,11 +223,23 @@ class RunDir:
                 f"{self} is not a run: it has no {self.config.name}; runs in {parent}:"
                 f" {', '.join(runs) or 'none'}"
             )
-        return config_json.from_json(self.config.read_text())
+        what = "the config of a run"
+        record = files.read_json(self.config, what)
+        try:
+            return config_json.from_record(record)
+        except (TypeError, ValueError, AttributeError, KeyError) as error:
+            raise ValueError(f"{self.config}: {error}; expected {what}") from error
 
     def read_source(self) -> dict[str, str] | None:
         """Return ``origin`` and ``digest`` of the source, None when it has (or recorded) none."""
-        return json.loads(self.source.read_text()) if self.source.is_file() else None
+        if not self.source.exists():
+            return None
+        found = files.read_json(self.source, "the source of a run")
+        if not isinstance(found, dict) or not {"origin", "digest"} <= found.keys():
+            raise files.FileError(
+                f"{self.source} holds {found!r}, expected origin and digest of a source"
+            )
+        return found
 
     def identity(self, config: TrainConfig) -> dict[str, str]:
         """Return the identity columns of the run's tables."""
@@ -242,16 +250,13 @@ class RunDir:
         self, config: TrainConfig, env_steps: int, values: dict[str, np.ndarray]
     ) -> None:
         """Write the closing episodes, measures [E], whole or not at all; NaN has no row."""
-        partial = self.episodes.with_name(self.episodes.name + ".partial")
         identity = self.identity(config).values()
-        with partial.open("w", newline="") as file:
-            writer = csv.writer(file, lineterminator="\n")
-            writer.writerow(EVAL_COLUMNS)
-            for name, column in values.items():
-                for episode in np.flatnonzero(~np.isnan(column)):
-                    row = [env_steps, episode, name, f"{float(column[episode]):.9g}"]
-                    writer.writerow([*identity, *row])
-        partial.replace(self.episodes)
+        rows = [
+            [*identity, env_steps, episode, name, f"{float(column[episode]):.9g}"]
+            for name, column in values.items()
+            for episode in np.flatnonzero(~np.isnan(column))
+        ]
+        files.write_csv(self.episodes, [EVAL_COLUMNS, *rows])
 
     @contextlib.contextmanager
     def exclusive(self, wait_s: float = 1.0) -> Iterator[None]:
@@ -364,9 +369,3 @@ def _commit() -> str:
     except (OSError, subprocess.TimeoutExpired):
         return "unknown"
     return out.stdout.strip() or "unknown"
-
-
-def _write(path: Path, text: str) -> None:
-    partial = path.with_name(path.name + ".partial")
-    partial.write_text(text)
-    partial.replace(path)

@@ -33,9 +33,7 @@ def check_weights_fit(config: TrainConfig, preset: str) -> None:
             check_layouts(config, task, layout, f"the source task {task}")
 
 
-def check_layouts(
-    config: TrainConfig, task: str, layout: tuple[Entry, ...], origin: str
-) -> None:
+def check_layouts(config: TrainConfig, task: str, layout: tuple[Entry, ...], origin: str) -> None:
     """Check that a policy of ``task`` that observes ``layout`` observes what ``config.task`` shows.
 
     Raises:

@@ -1,0 +1,127 @@
+"""Arrays in files: written whole or not at all, read without pickles and without surprises.
+
+What an archive and the headers of its arrays declare is compared with what the file holds before
+anything is allocated. Everything else about files: ``files``.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import zipfile
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from twirl_mjx import files
+
+MAX_RATIO = 100
+"""Arrays of more than 64 MB may be compressed to this share at best: zeros only are smaller."""
+
+
+def write_npy(path: str | Path, array: np.ndarray) -> None:
+    """Write one array of numbers as ``.npy``, whole or not at all."""
+    array = np.asarray(array, order="C")
+    with files.write_atomic(path) as file:
+        header = np.lib.format.header_data_from_array_1_0(array)
+        np.lib.format.write_array_header_1_0(file, header)
+        file.write(array.data)  # numpy's own tofile hides why a disk refuses
+
+
+def write_npz(
+    path: str | Path, arrays: Mapping[str, np.ndarray], *, compressed: bool = False
+) -> None:
+    """Write arrays as ``.npz``, whole or not at all; equal arrays give equal bytes."""
+    save = np.savez_compressed if compressed else np.savez
+    with files.write_atomic(path) as file:
+        save(file, allow_pickle=False, **arrays)  # pyright: ignore[reportArgumentType]
+
+
+def read_npy(path: str | Path, what: str, limit: int = files.SIZE_LIMIT) -> np.ndarray:
+    """Return the array of a ``.npy`` file, checked as those of :func:`read_npz`.
+
+    Raises:
+        FileError: As :func:`read_npz`.
+    """
+    size = files.check_readable(path, what, limit)
+    with open(path, "rb") as file, _named(path, ".npy file", what):
+        return _read_array(file, size)
+
+
+def read_npz(
+    path: str | Path, what: str, limit: int = files.SIZE_LIMIT, remedy: str = ""
+) -> dict[str, np.ndarray]:
+    """Return the arrays of a ``.npz`` archive by name; nothing is unpickled.
+
+    The sizes that the archive and the headers of its arrays declare are compared with each other,
+    with ``limit`` and with the size of the file before anything is allocated.
+
+    Raises:
+        FileError: As :func:`check_readable`, or no such archive; the message has the reason.
+    """
+    size = files.check_readable(path, what, limit, remedy)
+    with open(path, "rb") as file, _named(path, ".npz archive", what, remedy):
+        if file.read(6) == np.lib.format.MAGIC_PREFIX:
+            raise ValueError("it holds one array, not an archive")
+        with zipfile.ZipFile(file) as archive:
+            members = {info.filename: info for info in archive.infolist()}
+            total = sum(info.file_size for info in members.values())
+            if total > min(limit, max(64 * files.MB, MAX_RATIO * size)):
+                raise ValueError(f"{size:,} bytes that would become {total:,}")
+            arrays = {}
+            for name, info in members.items():
+                with archive.open(info) as member:
+                    arrays[name.removesuffix(".npy")] = _read_array(member, info.file_size)
+            return arrays
+
+
+def _read_array(file: Any, size: int) -> np.ndarray:
+    """Return the array of a stream in numpy's format that has ``size`` bytes.
+
+    Raises:
+        ValueError: Its header does not describe ``size`` bytes, or it holds Python objects.
+    """
+    version = np.lib.format.read_magic(file)
+    read = {
+        (1, 0): np.lib.format.read_array_header_1_0,
+        (2, 0): np.lib.format.read_array_header_2_0,
+    }.get(version)
+    if read is None:
+        raise ValueError(f"an array of format {version}, need (1, 0) or (2, 0)")
+    try:
+        shape, fortran, dtype = read(file)
+    except MemoryError as error:  # the parser's stack, not an array
+        raise ValueError("a header that is no description of an array") from error
+    if dtype.hasobject:
+        raise ValueError("an array of Python objects, which are not loaded")
+    if not dtype.itemsize or min(shape, default=0) < 0:
+        raise ValueError(f"an array of shape {shape} and type {dtype!r}")
+    expected = math.prod(shape) * dtype.itemsize
+    found = size - file.tell()
+    if expected != found:
+        raise ValueError(
+            f"an array of shape {shape} and type {dtype} has {expected:,} bytes, the file {found:,}"
+        )
+    content = bytearray(expected)
+    view = memoryview(content)
+    while len(view):
+        count = file.readinto(view[: files.MB])
+        if not count:
+            raise EOFError("it ends within an array")
+        view = view[count:]
+    file.read(1)  # the end of a member of an archive, where its checksum is compared
+    return np.frombuffer(content, dtype).reshape(shape, order="F" if fortran else "C")
+
+
+@contextlib.contextmanager
+def _named(path: str | Path, kind: str, what: str, remedy: str = "") -> Iterator[None]:
+    """Turn what a damaged file makes its parser raise into one error that names the file."""
+    try:
+        yield
+    except MemoryError:
+        raise
+    except Exception as error:  # parsers of zip, deflate and Python literals share no base class
+        why = f"{path} is not a readable {kind}: {error}"
+        raise files.FileError(f"{why}; expected {what}{files.then(remedy)}") from error
