@@ -8,6 +8,7 @@ from twirl_mjx.commands.options import parse_train, say
 from twirl_mjx.config import SCRIPTED_SOURCES, SOURCE_OF, TrainConfig
 from twirl_mjx.presets import starts_from_nominal_run
 from twirl_mjx.training import pipeline, rundir
+from twirl_mjx.training.sinks.registry import resolve
 
 
 def main(argv: list[str]) -> int:
@@ -15,9 +16,10 @@ def main(argv: list[str]) -> int:
     options = parse_train(argv, "twirl collect")
     config = options.config
     check_source(config, options.preset)
+    sinks = resolve(options.log)
     name = options.name or rundir.default_name(config, options.preset)
     run_dir = options.runs / rundir.check_name(name)
-    source = pipeline.find_source(config, options.preset, options.runs, say)
+    source = pipeline.find_source(config, options.preset, options.runs, say, sinks)
     with rundir.exclusive(run_dir):
         rundir.open_run(run_dir, config, source.identity)
         path = run_dir / "source.npz"

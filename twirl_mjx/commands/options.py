@@ -26,6 +26,9 @@ class TrainOptions:
     """Name of the run; derived from task, variant, preset and seed by default."""
     runs: Path
     """Folder of all runs."""
+    log: tuple[str, ...]
+    """Where metrics go beside metrics.csv, TensorBoard and the terminal: wandb, trackio or a sink
+    of your own, FILE.py:NAME."""
     config: Annotated[TrainConfig, tyro.conf.arg(name="")]
 
 
@@ -59,6 +62,7 @@ def parse_train(argv: list[str], prog: str = "twirl train") -> TrainOptions:
         preset=preset,
         name=None,
         runs=Path(known.runs),
+        log=(),
         config=make_config(known.task, preset),
     )
     return parse(TrainOptions, argv, prog, default)

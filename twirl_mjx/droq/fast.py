@@ -17,7 +17,7 @@ from typing import cast
 import jax
 import jax.numpy as jnp
 
-from twirl_mjx.config import DroqConfig
+from twirl_mjx.droq.config import DroqConfig
 from twirl_mjx.droq import dropout, fused, losses, packing
 from twirl_mjx.droq.networks import Params, actor_distribution, squash
 from twirl_mjx.droq.packing import PackedCritic

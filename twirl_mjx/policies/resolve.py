@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from twirl_mjx import config_json
 from twirl_mjx.checks import check_choice
 from twirl_mjx.config import SCRIPTED_SOURCES, TASKS, TrainConfig
+from twirl_mjx.droq.learner import LEARNER
 from twirl_mjx.policies import scripted
 from twirl_mjx.policies.clip import ClipPolicy
 from twirl_mjx.policies.function import from_policy
@@ -126,7 +127,8 @@ def _check_task(header: PolicyHeader, origin: str) -> None:
 
 def _act_of(loaded: NumpyPolicy | OnnxPolicy, noise: bool) -> ActOnObs:
     if isinstance(loaded, NumpyPolicy):
-        return actor_act(jax.tree.map(jnp.asarray, dict(loaded.actor_params)), noise=noise)
+        actor = jax.tree.map(jnp.asarray, dict(loaded.actor_params))
+        return actor_act(LEARNER, actor, noise=noise)
     return from_policy(loaded).on_observation
 
 

@@ -7,7 +7,7 @@ import dataclasses
 import math
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +15,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from twirl_mjx import config_json
 from twirl_mjx.config import TrainConfig
-from twirl_mjx.droq import learner as droq
-from twirl_mjx.droq.state import DroqState
-from twirl_mjx.evaluation.measures import episode_means
-from twirl_mjx.evaluation.rollout import make_evaluate
+from twirl_mjx.evaluation.measures import MEASURES, episode_means
+from twirl_mjx.evaluation.rollout import ActFn, make_evaluate
 from twirl_mjx.policies.learned import NumpyPolicy, PolicyHeader, load_policy, save_policy
 from twirl_mjx.replay.ring import RingBuffer
 from twirl_mjx.tasks.observations import layout_slices
@@ -28,9 +27,12 @@ from twirl_mjx.tasks.vector import VectorEnv
 from twirl_mjx.training import rundir, state
 from twirl_mjx.training.checkpoint import Checkpoints, has_checkpoint
 from twirl_mjx.training.guards import check_experience, check_finite
-from twirl_mjx.training.metrics import RunLogger
+from twirl_mjx.training.learners import check_learner, learner_of
+from twirl_mjx.training.logger import RunLogger
 from twirl_mjx.training.signals import stop_on_signal
+from twirl_mjx.training.sinks.base import RunInfo, Sink
 from twirl_mjx.training.state import TrainState
+from twirl_mjx.types import Learner, MetricInfo
 
 EVAL_CSV = "eval.csv"
 EVAL_COLUMNS = (
@@ -49,9 +51,13 @@ class Outcome:
     """Mean measures of the closing evaluation of the best policy; empty unless finished."""
 
 
-def act_mean(params: Any, memory: Any, env_state: Any, key: jax.Array) -> tuple[jax.Array, Any]:
-    """Act deterministically with actor parameters; an ``ActFn`` without memory."""
-    return droq.mean_action(params, env_state.obs), memory
+def act_mean(learner: Learner) -> ActFn:
+    """Return how a learner's actor acts in evaluation: deterministically, without memory."""
+
+    def act(params: Any, memory: Any, env_state: Any, key: jax.Array) -> tuple[jax.Array, Any]:
+        return learner.mean(params, env_state.obs), memory
+
+    return act
 
 
 def no_memory(env_state: Any) -> tuple[()]:
@@ -87,11 +93,14 @@ class Run:
 
         Raises:
             RunMismatchError: The directory holds another run.
+            ValueError: A function of the learner does not do what ``types.Learner`` says.
         """
+        self.env = make_env(config, training=True)
+        check_learner(config.droq, self.env.observation_size, self.env.action_size)
         rundir.open_run(run_dir, config)
         self.config = config
         self.run_dir = run_dir
-        self.env = make_env(config, training=True)
+        self.replay_ratio = config.droq.utd * config.droq.batch_size
         self.checkpoints = Checkpoints(run_dir)
         self.stage = stage
         self.source = source
@@ -100,10 +109,24 @@ class Run:
         self.took_weights = False
         self.progress: dict[str, Any] = {"best": -math.inf, "wall_s": 0.0, "inserted": 0}
         env = make_env(config, num_envs=config.eval.episodes)
-        self._evaluate = make_evaluate(env, no_memory, act_mean)
+        self._evaluate = make_evaluate(env, no_memory, act_mean(learner_of(config.droq)))
         self._epoch = state.compile_epoch(config, self.env)
 
-    def start(self, initial: Callable[[DroqState], DroqState] | None) -> TrainState:
+    def info(self) -> RunInfo:
+        """Return what sinks are told; call it after :meth:`start`, which may resume."""
+        measures = MEASURES[self.config.task].items()
+        return RunInfo(
+            directory=self.run_dir,
+            identity=rundir.identity(self.run_dir, self.config),
+            total_env_steps=self.config.total_env_steps,
+            stage=self.stage,
+            resume_env_steps=self.resumed_at,
+            measures={name: MetricInfo(measure.about, measure.unit) for name, measure in measures},
+            learning=learner_of(self.config.droq).metrics,
+            config=config_json.flatten(self.config),
+        )
+
+    def start(self, initial: Callable[[Any], Any] | None) -> TrainState:
         """Return the state to begin or resume from.
 
         Args:
@@ -143,7 +166,7 @@ class Run:
             "shift": self.config.shift,
             "env_steps": int(train_state.env_steps),
             "grad_steps": int(train_state.learner.grad_steps),
-            "replay_ratio": self.config.droq.replay_ratio,
+            "replay_ratio": self.replay_ratio,
             "wall_s": round(self.progress["wall_s"], 1),
             "options": dataclasses.asdict(getattr(self.config, self.config.task)),
             "evaluation": means,
@@ -179,7 +202,7 @@ class Run:
             else:
                 train_state, metrics = self._epoch(train_state)
             values = {name: float(value) for name, value in metrics.items()}
-            values |= {"replay_ratio": config.droq.replay_ratio, "source_rows": self.source_rows}
+            values |= {"replay_ratio": self.replay_ratio, "source_rows": self.source_rows}
             check_finite(train_state.learner)
             check_experience(train_state)
             self.progress["wall_s"] = before + time.monotonic() - began
@@ -202,8 +225,9 @@ def train(
     run_dir: Path,
     *,
     source: RingBuffer | None = None,
-    initial: Callable[[DroqState], DroqState] | None = None,
+    initial: Callable[[Any], Any] | None = None,
     stage: str = "train",
+    sinks: Sequence[Sink] = (),
 ) -> Outcome:
     """Train (or resume) one run to its budget.
 
@@ -213,6 +237,7 @@ def train(
         source: Frozen source experience; needed when ``config.uses_source_data``.
         initial: Changes the fresh learner before the first transition.
         stage: Name shown with the progress.
+        sinks: Where metrics go beside ``metrics.csv``, TensorBoard and the terminal.
 
     Raises:
         RunMismatchError: The directory holds another run, or a finished one that cannot go on.
@@ -229,16 +254,7 @@ def train(
     try:
         train_state = run.start(initial)
         steps = run.resumed_at or 0
-        with (
-            stop_on_signal() as stop,
-            RunLogger(
-                run_dir,
-                rundir.identity(run_dir, config),
-                config.total_env_steps,
-                stage,
-                run.resumed_at,
-            ) as logger,
-        ):
+        with stop_on_signal() as stop, RunLogger(run.info(), sinks) as logger:
             if steps:
                 logger.announce(f"resuming {run_dir.name} at {steps:,} transitions")
             train_state = run.loop(train_state, logger, stop)
@@ -264,7 +280,7 @@ def final_evaluation(config: TrainConfig, run_dir: Path, env_steps: int) -> dict
     assert isinstance(policy, NumpyPolicy), "a run writes .npz policies"
     actor = jax.tree.map(jnp.asarray, dict(policy.actor_params))
     env = make_env(config, num_envs=config.eval.final_episodes)
-    evaluate = make_evaluate(env, no_memory, act_mean)
+    evaluate = make_evaluate(env, no_memory, act_mean(learner_of(config.droq)))
     values = evaluate(actor, jax.random.key(config.eval.seed + 1))
     write_episodes(run_dir / EVAL_CSV, rundir.identity(run_dir, config), env_steps, values)
     return episode_means(values)

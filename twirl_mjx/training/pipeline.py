@@ -11,7 +11,7 @@ import dataclasses
 import difflib
 import hashlib
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +28,8 @@ from twirl_mjx.tasks.imitate import load_clip
 from twirl_mjx.tasks.registry import make_env, make_task
 from twirl_mjx.training import loop, rundir, source_rules
 from twirl_mjx.training.checkpoint import has_checkpoint, load_replay
+from twirl_mjx.training.sinks.base import Sink
+from twirl_mjx.training.sinks.registry import resolve
 from twirl_mjx.training.source import Source, collect
 from twirl_mjx.training.weights import check_weights_fit, source_weights
 
@@ -40,7 +42,14 @@ class StoppedError(RuntimeError):
     exit_status = exits.STOPPED
 
 
-def run(config: TrainConfig, preset: str, runs_dir: Path, name: str | None, say: Say) -> Path:
+def run(
+    config: TrainConfig,
+    preset: str,
+    runs_dir: Path,
+    name: str | None,
+    say: Say,
+    sinks: Sequence[str | Sink] = (),
+) -> Path:
     """Train a task to its budget, with every stage before it that is missing.
 
     Args:
@@ -49,6 +58,7 @@ def run(config: TrainConfig, preset: str, runs_dir: Path, name: str | None, say:
         runs_dir: Folder of all runs.
         name: Name of the run; derived from the config by default.
         say: Prints one line for a person.
+        sinks: Where metrics go beside the usual three, by name or as objects; see ``sinks``.
 
     Returns:
         The run directory.
@@ -58,6 +68,7 @@ def run(config: TrainConfig, preset: str, runs_dir: Path, name: str | None, say:
         ValueError: The variant does not fit the task, or the source does not fit the variant.
         RunBusyError: Another process works in the run directory.
     """
+    sinks = resolve(sinks)
     run_dir = runs_dir / rundir.check_name(name or rundir.default_name(config, preset))
     source_rules.check_source_is_used(config, preset)
     make_task(config)  # refuses options that only the task can judge
@@ -65,13 +76,13 @@ def run(config: TrainConfig, preset: str, runs_dir: Path, name: str | None, say:
         with rundir.exclusive(run_dir):
             if is_finished(config, run_dir, None, say):
                 return run_dir
-            return _train(config, run_dir, None, None)
+            return _train(config, run_dir, None, None, sinks)
     check_weights_fit(config, preset)
     refuse_early(config, run_dir)
     if _outlived_its_source(config, preset, runs_dir, run_dir):
         say(f"{run_dir} is finished; its source is no longer there to compare")
         return run_dir
-    source = find_source(config, preset, runs_dir, say)
+    source = find_source(config, preset, runs_dir, say, sinks)
     fresh_weights = config.uses_source_weights and not has_checkpoint(run_dir)
     initial = source_weights(config, source, say) if fresh_weights else None
     with rundir.exclusive(run_dir):
@@ -81,7 +92,7 @@ def run(config: TrainConfig, preset: str, runs_dir: Path, name: str | None, say:
         if config.variant == "zero-shot":
             return zero_shot(config, run_dir, source, say)
         data = source_data(config, run_dir, source, say) if config.uses_source_data else None
-        return _train(config, run_dir, data, initial)
+        return _train(config, run_dir, data, initial, sinks)
 
 
 def refuse_early(config: TrainConfig, run_dir: Path) -> None:
@@ -131,14 +142,23 @@ def _train(
     run_dir: Path,
     data: ring.RingBuffer | None,
     initial: Callable[[DroqState], DroqState] | None,
+    sinks: Sequence[Sink],
 ) -> Path:
-    outcome = loop.train(config, run_dir, source=data, initial=initial, stage=config.task)
+    outcome = loop.train(
+        config, run_dir, source=data, initial=initial, stage=config.task, sinks=sinks
+    )
     if not outcome.finished:
         raise StoppedError(f"{run_dir.name} stopped at {outcome.env_steps:,} transitions")
     return run_dir
 
 
-def find_source(config: TrainConfig, preset: str, runs_dir: Path, say: Say) -> Source:
+def find_source(
+    config: TrainConfig,
+    preset: str,
+    runs_dir: Path,
+    say: Say,
+    sinks: Sequence[Sink] = (),
+) -> Source:
     """Return the source of a run (``source_rules`` says which), training it when it is missing.
 
     Raises:
@@ -162,7 +182,7 @@ def find_source(config: TrainConfig, preset: str, runs_dir: Path, say: Say) -> S
         case source_rules.RunOf(first):
             run_dir = runs_dir / rundir.default_name(first, preset)
             say(f"stage 1 of 3: source policy, task {first.task}, in {run_dir}")
-            return _from_path(config, run(first, preset, runs_dir, None, say))
+            return _from_path(config, run(first, preset, runs_dir, None, say, sinks))
 
 
 def no_such_source(path: Path, runs_dir: Path) -> str:

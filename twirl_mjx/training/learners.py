@@ -1,0 +1,116 @@
+"""Learners by the class of their settings: those of a config decide who trains the run."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from twirl_mjx.droq.learner import LEARNER
+from twirl_mjx.policies.learned import check_params
+from twirl_mjx.types import Learner, Transition
+
+LEARNERS: dict[type, Learner] = {LEARNER.Config: LEARNER}
+
+
+def register(learner: Learner) -> Learner:
+    """Make a learner known, and return it: a run whose ``droq`` settings are of its class uses it.
+
+    Raises:
+        ValueError: The class of its settings is that of another learner.
+    """
+    other = LEARNERS.setdefault(learner.Config, learner)
+    if other is not learner:
+        raise ValueError(
+            f"learner {learner.name}: {learner.Config.__name__} holds the settings of learner"
+            f" {other.name}; derive a class of its own"
+        )
+    return learner
+
+
+def learner_of(config: Any) -> Learner:
+    """Return the learner whose settings these are.
+
+    Raises:
+        ValueError: Nobody registered a learner with such settings.
+    """
+    if type(config) not in LEARNERS:
+        known = ", ".join(kind.__name__ for kind in LEARNERS)
+        raise ValueError(
+            f"no learner has settings of class {type(config).__name__}: register it with"
+            f" twirl_mjx.training.learners.register (known: {known})"
+        )
+    return LEARNERS[type(config)]
+
+
+def check_learner(config: Any, observation_size: int, action_size: int) -> None:
+    """Check what every function of a learner returns, before anything is compiled.
+
+    Args:
+        config: Settings of the learner.
+        observation_size: O.
+        action_size: A.
+
+    Raises:
+        ValueError: One line that names learner, function, what it returned and what was expected.
+    """
+    learner, key = learner_of(config), jax.eval_shape(jax.random.key, 0)
+    rows = (config.updates_per_block, config.batch_size)
+    obs = _float32(*rows, observation_size)
+    minibatches = Transition(
+        obs, _float32(*rows, action_size), _float32(*rows), _array(rows, jnp.bool_), obs
+    )
+    try:
+        at = "init"
+        state = jax.eval_shape(lambda k: learner.init(k, config, observation_size, action_size), key)
+        at = "init, state.grad_steps"
+        _expect(state.grad_steps, _array((), jnp.int32))
+        at = "init, state.actor"
+        zeros = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), state.actor)
+        check_params(zeros, observation_size, action_size)
+        at = "sample"
+        _expect(jax.eval_shape(learner.sample, state.actor, obs, key), minibatches.action)
+        at = "mean"
+        _expect(jax.eval_shape(learner.mean, state.actor, obs), minibatches.action)
+        at = "update"
+        after, metrics = jax.eval_shape(
+            lambda s, m, k: learner.update(s, config, m, k), state, minibatches, key
+        )
+        at = "update, the state after it"
+        _expect(after, state)
+        at = "update, its metrics (named in Learner.metrics)"
+        _expect(metrics, {name: _float32() for name in learner.metrics})
+    except Exception as error:
+        why = " ".join(str(error).split())
+        raise ValueError(f"learner {learner.name}: {at}: {why} ({type(error).__name__})") from error
+
+
+def _array(shape: tuple[int, ...], dtype: Any) -> jax.ShapeDtypeStruct:
+    return jax.ShapeDtypeStruct(shape, dtype)
+
+
+def _float32(*shape: int) -> jax.ShapeDtypeStruct:
+    return _array(shape, jnp.float32)
+
+
+def _expect(found: Any, expected: Any) -> None:
+    """Compare two trees of shapes, leaf by leaf.
+
+    Raises:
+        ValueError: Naming the first leaf that differs, what it is and what was expected.
+    """
+    has, needs = (
+        {
+            jax.tree_util.keystr(path, simple=True, separator="."): f"{leaf.dtype}{[*leaf.shape]}"
+            for path, leaf in jax.tree_util.tree_flatten_with_path(tree)[0]
+        }
+        for tree in (found, expected)
+    )
+    for name in needs | has:
+        if has.get(name) != needs.get(name):
+            raise ValueError(
+                f"{name or 'the array'} is {has.get(name, 'missing')}, expected"
+                f" {needs.get(name, 'none of that name')}"
+            )
