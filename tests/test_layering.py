@@ -14,7 +14,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = "twirl_mjx"
 
-BASE = {"types", "checks", "exits", "config", "presets", "config_json", "assets"}
+BASE = {"types", "checks", "exits", "plugins", "config", "presets", "config_json", "assets"}
 WORLD = BASE | {"sim", "motion"}
 ACTING = WORLD | {"tasks", "droq", "policies"}
 ALLOWED: dict[str, set[str]] = {
@@ -22,14 +22,15 @@ ALLOWED: dict[str, set[str]] = {
     "checks": set(),
     "exits": set(),
     "assets": set(),
-    "config": {"types", "checks"},
+    "plugins": {"checks"},
+    "droq": {"types", "checks"},
+    "config": {"types", "checks", "droq"},
     "presets": {"checks", "config"},
     "config_json": {"checks", "config", "presets"},
     "sim": BASE,
     "motion": WORLD,
     "tasks": WORLD,
     "replay": {"types", "checks", "config"},
-    "droq": {"types", "checks", "config"},
     "policies": ACTING,
     "evaluation": ACTING,
     "training": ACTING | {"evaluation", "replay"},

@@ -207,7 +207,7 @@ class TrainConfig:
     """Transitions with uniformly random actions before the first update."""
     env: EnvConfig = EnvConfig()
     """The worlds."""
-    droq: DroqConfig = DroqConfig()
+    droq: DroqConfig = DroqConfig()  # noqa: RUF009 (frozen)
     """The learner."""
     replay: ReplayConfig = ReplayConfig()
     """The mixed replay."""

@@ -17,8 +17,8 @@ from typing import cast
 import jax
 import jax.numpy as jnp
 
-from twirl_mjx.droq.config import DroqConfig
 from twirl_mjx.droq import dropout, fused, losses, packing
+from twirl_mjx.droq.config import DroqConfig
 from twirl_mjx.droq.networks import Params, actor_distribution, squash
 from twirl_mjx.droq.packing import PackedCritic
 from twirl_mjx.droq.state import ADAM_B1, ADAM_B2, ADAM_EPSILON, AdamState, CriticState

@@ -12,8 +12,8 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
-from twirl_mjx.droq.config import DroqConfig
 from twirl_mjx.droq import fast, losses, networks, plain
+from twirl_mjx.droq.config import DroqConfig
 from twirl_mjx.droq.networks import Params
 from twirl_mjx.droq.state import CriticState, DroqState, adam_init, adam_step
 from twirl_mjx.types import Learner, MetricInfo, Metrics, Transition

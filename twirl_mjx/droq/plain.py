@@ -11,8 +11,8 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
-from twirl_mjx.droq.config import DroqConfig
 from twirl_mjx.droq import losses
+from twirl_mjx.droq.config import DroqConfig
 from twirl_mjx.droq.dropout import quantised_rate
 from twirl_mjx.droq.networks import Params, actor_distribution, critic_ensemble, squash
 from twirl_mjx.droq.state import CriticState, adam_step, polyak

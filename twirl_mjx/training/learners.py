@@ -64,7 +64,9 @@ def check_learner(config: Any, observation_size: int, action_size: int) -> None:
     )
     try:
         at = "init"
-        state = jax.eval_shape(lambda k: learner.init(k, config, observation_size, action_size), key)
+        state = jax.eval_shape(
+            lambda k: learner.init(k, config, observation_size, action_size), key
+        )
         at = "init, state.grad_steps"
         _expect(state.grad_steps, _array((), jnp.int32))
         at = "init, state.actor"
@@ -83,8 +85,9 @@ def check_learner(config: Any, observation_size: int, action_size: int) -> None:
         at = "update, its metrics (named in Learner.metrics)"
         _expect(metrics, {name: _float32() for name in learner.metrics})
     except Exception as error:
-        why = " ".join(str(error).split())
-        raise ValueError(f"learner {learner.name}: {at}: {why} ({type(error).__name__})") from error
+        kind = "" if isinstance(error, ValueError) else f"{type(error).__name__}: "
+        why = kind + " ".join(str(error).split())
+        raise ValueError(f"learner {learner.name}: {at}: {why}") from error
 
 
 def _array(shape: tuple[int, ...], dtype: Any) -> jax.ShapeDtypeStruct:

@@ -103,9 +103,7 @@ def collect_step(
     return state, result
 
 
-def update_blocks(
-    config: TrainConfig, state: TrainState, key: jax.Array
-) -> tuple[Any, Metrics]:
+def update_blocks(config: TrainConfig, state: TrainState, key: jax.Array) -> tuple[Any, Metrics]:
     """Run all blocks of critic updates that follow one vector step; none during warm-up.
 
     A loop with a trip count, not a ``lax.cond``, decides: a conditional would copy the rings.

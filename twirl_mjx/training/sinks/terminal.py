@@ -165,10 +165,7 @@ class Terminal:
             ),
         )
         body = Table.grid(expand=True, padding=(0, 2))
-        cells = [
-            Text.assemble((f"{label} ", "dim"), text)
-            for label, text in self._texts()
-        ]
+        cells = [Text.assemble((f"{label} ", "dim"), text) for label, text in self._texts()]
         for start in range(0, len(cells), 4):
             body.add_row(*cells[start : start + 4], *[Text()] * (4 - len(cells[start : start + 4])))
         parts: list[RenderableType] = [head, body]
