@@ -153,6 +153,32 @@ def test_settings_that_nobody_registered_are_refused() -> None:
         learners.learner_of(CloneConfig())
 
 
+@dataclasses.dataclass
+class ThawedConfig:
+    """Not frozen, so it has no hash."""
+
+    utd: float = 1.0
+    updates_per_block: int = 1
+    batch_size: int = 1
+
+
+class BareConfig:
+    utd = 1.0
+
+
+@pytest.mark.parametrize(
+    ("kind", "message"),
+    [
+        (ThawedConfig, "ThawedConfig should be a frozen dataclass with defaults for utd"),
+        (BareConfig, "it has no updates_per_block, batch_size"),
+    ],
+)
+def test_settings_without_what_training_reads_are_refused(kind: type, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        learners.register(dataclasses.replace(CLONE, Config=kind))
+    assert kind not in learners.LEARNERS
+
+
 @pytest.mark.parametrize("config", [DroqConfig(), DroqConfig(fast=False, utd=1.0)])
 def test_droq_keeps_what_the_protocol_asks(config: DroqConfig) -> None:
     learners.check_learner(config, 7, 3)

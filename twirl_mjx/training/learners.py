@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import jax
@@ -10,8 +11,10 @@ import numpy as np
 
 from twirl_mjx.droq.learner import LEARNER
 from twirl_mjx.policies.learned import check_params
-from twirl_mjx.types import Learner, Transition
+from twirl_mjx.types import Learner, LearnerConfig, Transition
 
+READ = ("utd", "updates_per_block", "batch_size")
+"""Settings of a learner that training reads."""
 LEARNERS: dict[type, Learner] = {LEARNER.Config: LEARNER}
 
 
@@ -19,8 +22,16 @@ def register(learner: Learner) -> Learner:
     """Make a learner known, and return it: a run whose ``droq`` settings are of its class uses it.
 
     Raises:
-        ValueError: The class of its settings is that of another learner.
+        ValueError: The class of its settings is that of another learner, or lacks what training
+            reads (``types.LearnerConfig``).
     """
+    kind = learner.Config
+    missing = [name for name in READ if not hasattr(kind, name)]
+    if missing or not (dataclasses.is_dataclass(kind) and kind.__hash__):
+        raise ValueError(
+            f"learner {learner.name}: {kind.__name__} should be a frozen dataclass with defaults"
+            f" for {', '.join(READ)}" + (f"; it has no {', '.join(missing)}" if missing else "")
+        )
     other = LEARNERS.setdefault(learner.Config, learner)
     if other is not learner:
         raise ValueError(
@@ -30,7 +41,7 @@ def register(learner: Learner) -> Learner:
     return learner
 
 
-def learner_of(config: Any) -> Learner:
+def learner_of(config: LearnerConfig) -> Learner:
     """Return the learner whose settings these are.
 
     Raises:
@@ -45,7 +56,7 @@ def learner_of(config: Any) -> Learner:
     return LEARNERS[type(config)]
 
 
-def check_learner(config: Any, observation_size: int, action_size: int) -> None:
+def check_learner(config: LearnerConfig, observation_size: int, action_size: int) -> None:
     """Check what every function of a learner returns, before anything is compiled.
 
     Args:
@@ -57,18 +68,14 @@ def check_learner(config: Any, observation_size: int, action_size: int) -> None:
         ValueError: One line that names learner, function, what it returned and what was expected.
     """
     learner, key = learner_of(config), jax.eval_shape(jax.random.key, 0)
-    rows = (config.updates_per_block, config.batch_size)
-    obs = _float32(*rows, observation_size)
-    minibatches = Transition(
-        obs, _float32(*rows, action_size), _float32(*rows), _array(rows, jnp.bool_), obs
-    )
+    minibatches = jax.eval_shape(lambda: _minibatches(config, observation_size, action_size))
+    obs, at = minibatches.obs, "init"
     try:
-        at = "init"
         state = jax.eval_shape(
             lambda k: learner.init(k, config, observation_size, action_size), key
         )
         at = "init, state.grad_steps"
-        _expect(state.grad_steps, _array((), jnp.int32))
+        _expect(state.grad_steps, jax.ShapeDtypeStruct((), jnp.int32))
         at = "init, state.actor"
         zeros = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), state.actor)
         check_params(zeros, observation_size, action_size)
@@ -83,19 +90,20 @@ def check_learner(config: Any, observation_size: int, action_size: int) -> None:
         at = "update, the state after it"
         _expect(after, state)
         at = "update, its metrics (named in Learner.metrics)"
-        _expect(metrics, {name: _float32() for name in learner.metrics})
+        scalar = jax.ShapeDtypeStruct((), jnp.float32)
+        _expect(metrics, dict.fromkeys(learner.metrics, scalar))
     except Exception as error:
         kind = "" if isinstance(error, ValueError) else f"{type(error).__name__}: "
         why = kind + " ".join(str(error).split())
         raise ValueError(f"learner {learner.name}: {at}: {why}") from error
 
 
-def _array(shape: tuple[int, ...], dtype: Any) -> jax.ShapeDtypeStruct:
-    return jax.ShapeDtypeStruct(shape, dtype)
-
-
-def _float32(*shape: int) -> jax.ShapeDtypeStruct:
-    return _array(shape, jnp.float32)
+def _minibatches(config: LearnerConfig, observation_size: int, action_size: int) -> Transition:
+    """Return what ``update`` is given."""
+    rows = (config.updates_per_block, config.batch_size)
+    obs = jnp.zeros((*rows, observation_size))
+    action = jnp.zeros((*rows, action_size))
+    return Transition(obs, action, jnp.zeros(rows), jnp.zeros(rows, bool), obs)
 
 
 def _expect(found: Any, expected: Any) -> None:

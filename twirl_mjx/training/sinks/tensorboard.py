@@ -6,12 +6,16 @@ import socket
 import time
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
-from tensorboardX.proto.event_pb2 import Event, SessionLog
-from tensorboardX.proto.summary_pb2 import Summary
+from tensorboardX.proto import event_pb2, summary_pb2
 from tensorboardX.record_writer import RecordWriter
 
 from twirl_mjx.training.sinks.base import RunInfo
+
+# protobuf makes these classes when it is imported, unseen by a type checker
+events: Any = event_pb2
+summaries: Any = summary_pb2
 
 TENSORBOARD_DIR = "tensorboard"
 PREFIX = "events.out.tfevents."
@@ -32,25 +36,30 @@ class TensorBoard:
                 old.unlink()
         self._writer = RecordWriter(str(folder / next_name(folder)))
         first = 0 if run.resume_env_steps is None else run.resume_env_steps + 1
-        self._write(Event(file_version="brain.Event:2"))
-        self._write(Event(step=first, session_log=SessionLog(status=SessionLog.START)))
+        self._write(events.Event(file_version="brain.Event:2"))
+        self._write(
+            events.Event(step=first, session_log=events.SessionLog(status=events.SessionLog.START))
+        )
         self._writer.flush()
 
     def log(
         self, env_steps: int, grad_steps: int, wall_s: float, values: Mapping[str, float]
     ) -> None:
         """Append one event with every value, and force it to disk."""
-        summary = Summary(
-            value=[Summary.Value(tag=name, simple_value=value) for name, value in values.items()]
+        summary = summaries.Summary(
+            value=[
+                summaries.Summary.Value(tag=name, simple_value=value)
+                for name, value in values.items()
+            ]
         )
-        self._write(Event(step=env_steps, summary=summary))
+        self._write(events.Event(step=env_steps, summary=summary))
         self._writer.flush()
 
     def close(self) -> None:
         """Close the file."""
         self._writer.close()
 
-    def _write(self, event: Event) -> None:
+    def _write(self, event: Any) -> None:
         event.wall_time = time.time()
         self._writer.write(event.SerializeToString())
 
