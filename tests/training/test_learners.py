@@ -22,7 +22,7 @@ from twirl_mjx.droq.state import AdamState, adam_init, adam_step
 from twirl_mjx.policies.learned import load_policy
 from twirl_mjx.replay import ring
 from twirl_mjx.tasks.registry import make_env
-from twirl_mjx.training import learners, loop, state
+from twirl_mjx.training import learners, loop, state, weights
 from twirl_mjx.types import Learner, MetricInfo, Transition
 
 
@@ -146,6 +146,14 @@ def test_the_class_of_the_settings_decides_who_learns(clone: Learner) -> None:
     assert learners.register(CLONE) is CLONE  # again, as a file that is loaded twice does
     with pytest.raises(ValueError, match="DroqConfig holds the settings of learner droq"):
         learners.register(dataclasses.replace(CLONE, Config=DroqConfig))
+
+
+def test_networks_of_another_learner_are_not_taken_over(
+    clone: Learner, clone_config: TrainConfig
+) -> None:
+    config = dataclasses.replace(clone_config, task="biped", variant="weights")
+    with pytest.raises(ValueError, match="networks of droq, not those of learner clone"):
+        weights.check_weights_fit(config, "debug")
 
 
 def test_settings_that_nobody_registered_are_refused() -> None:
