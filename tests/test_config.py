@@ -48,7 +48,7 @@ def test_paper_preset_has_the_numbers_of_table_4() -> None:
     assert (droq.initial_temperature, droq.target_entropy) == (1.0, None)
     assert (config.replay.phi, config.replay.source_size) == (0.5, 50_000)
     assert config.total_env_steps == 1_000_000
-    assert droq.replay_ratio == 5120.0
+    assert droq.utd * droq.batch_size == 5120.0
 
 
 def test_names_of_shifts_agree_with_the_physics() -> None:

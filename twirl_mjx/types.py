@@ -1,8 +1,10 @@
-"""Types shared by every package: transitions, metrics and the policy protocols."""
+"""Types shared by every package: transitions, metrics, what a policy and what a learner is."""
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+import dataclasses
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple, Protocol
 
 import flax.struct
 import jax
@@ -58,3 +60,63 @@ class SourcePolicy(Protocol):
         be started afresh.
         """
         ...
+
+
+class MetricInfo(NamedTuple):
+    """Meaning of a metric."""
+
+    about: str
+    """What is measured, over what."""
+    unit: str
+    """Unit, ``1`` for a plain number."""
+
+
+class LearnerConfig(Protocol):
+    """What training reads of a learner's settings; the class may have any other field.
+
+    It is a frozen dataclass with a default for every field: hashable, static under jit.
+    """
+
+    @property
+    def utd(self) -> float:
+        """Critic updates per environment transition; may be below 1."""
+        ...
+
+    @property
+    def updates_per_block(self) -> int:
+        """U, minibatches handed to one call of ``update``; divides ``utd * num_envs``."""
+        ...
+
+    @property
+    def batch_size(self) -> int:
+        """B, rows of one minibatch."""
+        ...
+
+
+@dataclasses.dataclass(frozen=True)
+class Learner:
+    """A learner as a value; ``droq.learner.LEARNER`` is the first.
+
+    The functions are pure, traceable by jax and closed under ``vmap`` over a leading axis of
+    seeds. O is the size of an observation, A that of an action; arrays are float32.
+
+    The *state* is a pytree whose structure, shapes and dtypes never change. Two of its attributes
+    are read: ``actor``, parameters with the layers ``hidden_0`` ... ``hidden_n``, ``mean`` and
+    ``log_std`` of ``droq.networks``, because that is what a policy file holds; and ``grad_steps``,
+    an int32 scalar, which each ``update`` raises by U.
+    """
+
+    name: str
+    """How errors call it."""
+    Config: type
+    """Class of its settings, see ``LearnerConfig``; decides which learner trains a run."""
+    init: Callable[[jax.Array, Any, int, int], Any]
+    """(key, config, O, A) -> state before the first update."""
+    sample: Callable[[Any, jax.Array, jax.Array], jax.Array]
+    """(actor, obs [..., O], key) -> exploring actions [..., A] in [-1, 1]."""
+    mean: Callable[[Any, jax.Array], jax.Array]
+    """(actor, obs [..., O]) -> the deterministic actions [..., A] that are evaluated."""
+    update: Callable[[Any, Any, Transition, jax.Array], tuple[Any, Metrics]]
+    """(state, config, transitions [U, B, ...], key) -> (state, float32 scalars by name)."""
+    metrics: Mapping[str, MetricInfo]
+    """Meaning of every scalar that ``update`` reports."""

@@ -13,8 +13,8 @@ from twirl_mjx.bench import epoch, startup
 from twirl_mjx.bench.epoch import EpochBench
 from twirl_mjx.bench.startup import StartupBench
 from twirl_mjx.commands.options import parse_train
-from twirl_mjx.training.metrics import COLUMNS
 from twirl_mjx.training.presets import PRESETS, make_config
+from twirl_mjx.training.sinks.table import COLUMNS
 
 HEADER = ",".join(COLUMNS)
 

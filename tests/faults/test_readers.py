@@ -12,7 +12,6 @@ import pytest
 
 from twirl_mjx import cli, config_json, exits
 from twirl_mjx.assets import asset_path
-from twirl_mjx.config import TrainConfig
 from twirl_mjx.deploy.export import export_onnx
 from twirl_mjx.figures.plots import make_figures
 from twirl_mjx.figures.tables import CURVE_COLUMNS, TableError, read_table
@@ -21,6 +20,7 @@ from twirl_mjx.policies.learned import load_policy
 from twirl_mjx.sweep import gather, plan
 from twirl_mjx.sweep.plan import Cell
 from twirl_mjx.training import loop, metrics, rundir
+from twirl_mjx.training.config import TrainConfig
 
 CURVE = "run,task,shift,variant,seed,metric,env_steps,grad_steps,wall_s,value\n"
 EPISODE = "run,task,shift,variant,seed,env_steps,episode,metric,value\n"

@@ -15,7 +15,6 @@ from twirl_mjx import exits, faults, files
 from twirl_mjx.assets import asset_path
 from twirl_mjx.bench import report as bench_report
 from twirl_mjx.commands import evaluate
-from twirl_mjx.config import TrainConfig
 from twirl_mjx.deploy.export import export_onnx
 from twirl_mjx.deploy.video import write_strip, write_video
 from twirl_mjx.figures.canvas import write_png
@@ -29,6 +28,7 @@ from twirl_mjx.policies.learned import NumpyPolicy, load_policy, save_policy
 from twirl_mjx.replay import dataset
 from twirl_mjx.sweep.gather import write_table
 from twirl_mjx.training import loop, metrics, rundir
+from twirl_mjx.training.config import TrainConfig
 from twirl_mjx.types import Transition
 
 FRAMES = [np.random.default_rng(i).integers(0, 255, (64, 64, 3), np.uint8) for i in range(20)]

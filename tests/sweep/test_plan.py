@@ -98,7 +98,7 @@ def test_a_source_may_have_a_scripted_source_itself(tmp_path: Path) -> None:
 
 def test_file_names_are_those_of_training() -> None:
     from twirl_mjx.training.loop import EVAL_CSV
-    from twirl_mjx.training.metrics import CSV_NAME
+    from twirl_mjx.training.sinks.table import CSV_NAME
 
     assert (plan.EVAL_CSV, plan.METRICS_CSV) == (EVAL_CSV, CSV_NAME)
 

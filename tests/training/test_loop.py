@@ -129,6 +129,20 @@ def test_a_hole_in_the_stored_experience_is_named(whole_run: Path, tmp_path: Pat
         load_replay(tmp_path / "run")
 
 
+def test_leftovers_of_a_killed_save_are_swept(whole_run: Path, tmp_path: Path) -> None:
+    shutil.copytree(whole_run / "checkpoints", tmp_path / "checkpoints")
+    step = tmp_path / "checkpoints" / "orbax" / "128.orbax-checkpoint-tmp"
+    (step / "policy.orbax-checkpoint-tmp").mkdir(parents=True)
+    (step / "policy.orbax-checkpoint-tmp" / "data").write_text("half")
+    rows = tmp_path / "checkpoints" / "replay" / "rows_000000000096_000000000128.partial"
+    rows.write_text("half")
+    checkpoints = Checkpoints(tmp_path)
+    assert checkpoints.latest() == 96
+    checkpoints.close()
+    assert not step.exists()
+    assert not rows.exists()
+
+
 def test_a_finished_run_without_checkpoints_is_not_trained_anew(
     stand_config: TrainConfig, whole_run: Path, tmp_path: Path
 ) -> None:

@@ -1,230 +1,52 @@
+"""Names of metrics, and the page that explains them."""
+
 from __future__ import annotations
 
-import csv
-import io
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 import pytest
-from rich.console import Console
 
-from twirl_mjx.training import metrics as module
-from twirl_mjx.training.metrics import COLUMNS, METRICS, RunLogger, describe, metrics_markdown
-from twirl_mjx.training.progress import format_count, format_seconds
+from twirl_mjx.droq.learner import METRICS as LEARNING
+from twirl_mjx.tasks.measures import COMMON
+from twirl_mjx.tasks.registry import TASKS
+from twirl_mjx.training.metrics import FAMILIES, METRICS, describe
+from twirl_mjx.types import MetricInfo
 
-IDENTITY = {"run": "biped-0", "task": "biped", "shift": "none", "variant": "twirl", "seed": 0}
-
-
-class FakeTime:
-    """A clock that moves when told to."""
-
-    def __init__(self) -> None:
-        self.now = 100.0
-
-    def monotonic(self) -> float:
-        return self.now
+PAGE = Path(__file__).parents[2] / "docs" / "metrics.md"
 
 
-@pytest.fixture
-def clock(monkeypatch: pytest.MonkeyPatch) -> FakeTime:
-    fake = FakeTime()
-    monkeypatch.setattr("twirl_mjx.training.metrics.time", fake)
-    monkeypatch.setattr("twirl_mjx.training.progress.time", fake)
-    return fake
+def table(metrics: Mapping[str, MetricInfo]) -> str:
+    rows = [f"| `{name}` | {info.about} | {info.unit} |" for name, info in metrics.items()]
+    return "\n".join(["| metric | meaning | unit |", "|---|---|---|", *rows]) + "\n"
 
 
-def make_logger(run_dir: Path, text: io.StringIO | None = None, **changes: Any) -> RunLogger:
-    console = Console(file=text or io.StringIO(), width=200)
-    settings = {"total_env_steps": 1000, "stage": "train", "tensorboard": False} | changes
-    return RunLogger(run_dir, IDENTITY, console=console, **settings)
+def tables() -> dict[str, str]:
+    """Return every table of the page by its heading."""
+    families = {f"{prefix}<name>": info for prefix, info in FAMILIES.items()}
+    found = {"Every run": table(METRICS | families), "DroQ": table(LEARNING)}
+    for task in TASKS.builtin_names():
+        measures = TASKS.get(task).measures
+        found[f"Task {task}"] = table({k: MetricInfo(m.about, m.unit) for k, m in measures.items()})
+    return found
 
 
-def read_rows(run_dir: Path) -> list[dict[str, str]]:
-    with (run_dir / "metrics.csv").open(newline="") as file:
-        return list(csv.DictReader(file))
+@pytest.mark.parametrize("heading", tables())
+def test_the_page_explains_every_metric(heading: str) -> None:
+    expected = f"### {heading}\n\n{tables()[heading]}"
+    assert expected in PAGE.read_text(), f"docs/metrics.md should have:\n\n{expected}"
 
 
-def test_rows_are_tidy(tmp_path: Path, clock: FakeTime) -> None:
-    with make_logger(tmp_path) as logger:
-        clock.now += 2.5
-        logger.log(100, 200, {"return": np.float32(1.25), "world/upright": 0.5})
-    rows = read_rows(tmp_path)
-    assert tuple(rows[0]) == COLUMNS
-    by_name = {row["metric"]: row for row in rows}
-    assert by_name["return"] == {
-        "run": "biped-0", "task": "biped", "shift": "none", "variant": "twirl", "seed": "0",
-        "metric": "return", "env_steps": "100", "grad_steps": "200", "wall_s": "2.500",
-        "value": "1.25",
-    }  # fmt: skip
-    assert float(by_name["env_steps_per_s"]["value"]) == pytest.approx(40.0)
-    assert float(by_name["updates_per_s"]["value"]) == pytest.approx(80.0)
-    assert len(rows) == 4
+def test_what_every_task_measures_is_reported_by_training() -> None:
+    assert {*COMMON, "success"} <= set(METRICS)
 
 
-def test_undefined_metrics_write_no_row(tmp_path: Path) -> None:
-    with make_logger(tmp_path) as logger:
-        logger.log(1, 1, {"return": float("nan"), "q_mean": 2.0})
-    names = [row["metric"] for row in read_rows(tmp_path)]
-    assert "return" not in names
-    assert "q_mean" in names
-
-
-def test_rows_are_on_disk_before_the_run_ends(tmp_path: Path) -> None:
-    logger = make_logger(tmp_path)
-    logger.log(10, 0, {"reward": 1.0})
-    assert [row["metric"] for row in read_rows(tmp_path)][-1] == "reward"
-    logger.close()
-    logger.close()
-
-
-def values_of(run_dir: Path, metric: str) -> list[float]:
-    return [float(row["value"]) for row in read_rows(run_dir) if row["metric"] == metric]
-
-
-def test_compilation_is_announced_and_not_in_the_rates(tmp_path: Path, clock: FakeTime) -> None:
-    text = io.StringIO()
-    with make_logger(tmp_path, text) as logger:
-        with logger.compiling("train_epoch"):
-            clock.now += 23.0
-        logger.log(100, 50, {})
-        clock.now += 4.0
-        logger.log(200, 150, {})
-    assert "compiling train_epoch ...\n" in text.getvalue()
-    assert "compiling train_epoch ... 23 s\n" in text.getvalue()
-    assert values_of(tmp_path, "env_steps_per_s") == pytest.approx([25.0])
-    assert values_of(tmp_path, "updates_per_s") == pytest.approx([25.0])
-    assert values_of(tmp_path, "compile_s") == pytest.approx([23.0])
-    assert "eta 0:00:32" in text.getvalue()  # 800 steps at 25 a second
-
-
-def test_evaluation_time_is_not_in_the_rates(tmp_path: Path, clock: FakeTime) -> None:
-    with make_logger(tmp_path) as logger:
-        clock.now += 2.0
-        with logger.aside("evaluating ..."):
-            clock.now += 50.0
-        logger.log(100, 50, {})
-    assert values_of(tmp_path, "env_steps_per_s") == pytest.approx([50.0])
-    assert values_of(tmp_path, "compile_s") == []
-
-
-def test_resume_drops_rows_after_the_checkpoint(tmp_path: Path, clock: FakeTime) -> None:
-    with make_logger(tmp_path) as logger:
-        for steps in (100, 200, 300):
-            clock.now += 10.0
-            logger.log(steps, 2 * steps, {"q_mean": steps})
-    path = tmp_path / "metrics.csv"
-    path.write_text(
-        path.read_text() + "biped-0,biped,none,twirl,0,q_mean,150,3"
-    )  # cut off by a crash
-    clock.now += 1000.0
-    with make_logger(tmp_path, resume_env_steps=200) as logger:
-        clock.now += 5.0
-        logger.log(300, 600, {"q_mean": 3.5})
-    rows = [row for row in read_rows(tmp_path) if row["metric"] == "q_mean"]
-    assert [row["env_steps"] for row in rows] == ["100", "200", "300"]
-    assert [float(row["value"]) for row in rows] == [100.0, 200.0, 3.5]
-    assert [float(row["wall_s"]) for row in rows] == pytest.approx([10.0, 20.0, 25.0])
-
-
-def test_fresh_run_starts_the_file_anew(tmp_path: Path) -> None:
-    for value in (1.0, 2.0):
-        with make_logger(tmp_path) as logger:
-            logger.log(10, 0, {"q_mean": value})
-    assert [row["value"] for row in read_rows(tmp_path) if row["metric"] == "q_mean"] == ["2"]
-
-
-def test_a_run_stopped_before_its_first_epoch_keeps_its_rows(tmp_path: Path) -> None:
-    with make_logger(tmp_path) as logger:
-        logger.log(0, 0, {"eval/return": 7.0})
-    with make_logger(tmp_path, resume_env_steps=0) as logger:
-        logger.log(10, 0, {"q_mean": 1.0})
-    assert values_of(tmp_path, "eval/return") == [7.0]
-    assert values_of(tmp_path, "q_mean") == [1.0]
-
-
-def test_foreign_csv_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "metrics.csv").write_text("a,b\n1,2\n")
-    with pytest.raises(ValueError, match=r"metrics\.csv: line 1: there is no column 'env_steps'"):
-        make_logger(tmp_path, resume_env_steps=10)
-
-
-def test_unknown_names_are_refused(tmp_path: Path) -> None:
-    with make_logger(tmp_path) as logger:
-        with pytest.raises(ValueError, match=r"unknown metric 'critic_los'.*'critic_loss'"):
-            logger.log(1, 1, {"critic_los": 1.0})
-        with pytest.raises(ValueError, match="unknown metric 'world/'"):
-            logger.log(1, 1, {"world/": 1.0})
-    assert read_rows(tmp_path) == []
-    with pytest.raises(ValueError, match="identity needs exactly"):
-        RunLogger(tmp_path, {"run": "x"}, 1, "train")
-
-
-def test_every_metric_is_described() -> None:
-    table = metrics_markdown()
-    for name, info in METRICS.items():
-        assert info.description
-        assert info.unit
-        assert table.count(f"| `{name}` |") == 1
-        assert describe(name) is info
-    assert describe("eval/return").description.startswith("the metric after the slash")
-    assert "`eval/<name>`" in table
-
-
-def test_every_measure_of_an_episode_is_a_metric() -> None:
-    from twirl_mjx.tasks.measures import MEASURES
-
-    for task, measures in MEASURES.items():
-        assert set(measures) <= set(METRICS), task
-
-
-def test_plain_lines_tell_the_state(tmp_path: Path, clock: FakeTime) -> None:
-    text = io.StringIO()
-    with make_logger(tmp_path, text, total_env_steps=50_000) as logger:
-        logger.announce("collecting [50k] transitions")
-        clock.now += 10.0
-        values = {"return": 12.34, "standing_time": 3.21, "min_distance": 0.444, "q_mean": 7.0}
-        logger.log(12_500, 250_000, values)
-    lines = text.getvalue().splitlines()
-    assert lines[0] == "train biped-0: to 50k"
-    assert lines[1] == "collecting [50k] transitions"
-    assert lines[2] == (
-        "train biped-0  25.0 % | env 12.5k | updates 250k | eta 0:00:30 | env steps/s 1250 | "
-        "updates/s 25000 | return 12.3 | standing 3.2 s | min distance 0.44 m | Q 7"
-    )
-
-
-def test_terminal_shows_a_live_panel(tmp_path: Path) -> None:
-    text = io.StringIO()
-    console = Console(file=text, force_terminal=True, width=120)
-    with RunLogger(tmp_path, IDENTITY, 1000, "train", console=console, tensorboard=False) as logger:
-        with logger.compiling("train_epoch"):
-            logger._view._live.refresh()  # type: ignore[union-attr]
-        logger.log(500, 1000, {"return": 42.0, "temperature": 0.125})
-    shown = text.getvalue()
-    assert "compiling train_epoch ... 0 s" in shown
-    for part in ("biped-0", "500 / 1k env steps", "42.0", "0.125", "ETA"):
-        assert part in shown
-
-
-def test_tensorboard_gets_the_same_values(tmp_path: Path) -> None:
-    with make_logger(tmp_path, tensorboard=True) as logger:
-        logger.log(64, 10, {"q_mean": 2.5, "return": float("nan")})
-    files = list((tmp_path / module.TENSORBOARD_DIR).glob("events.*"))
-    assert len(files) == 1
-    content = files[0].read_bytes()
-    assert b"q_mean" in content
-    assert b"return" not in content
-    assert np.float32(2.5).tobytes() in content
-
-
-@pytest.mark.parametrize(
-    ("number", "text"), [(0, "0"), (950, "950"), (12_345, "12.3k"), (1_250_000, "1.25M")]
-)
-def test_counts(number: int, text: str) -> None:
-    assert format_count(number) == text
-
-
-def test_durations() -> None:
-    assert format_seconds(3723.4) == "1:02:03"
-    assert format_seconds(None) == "-:--:--"
+def test_a_name_is_described_by_whoever_declares_it() -> None:
+    own = {"hops": MetricInfo("hops in an episode", "1")}
+    assert describe("hops", own) is own["hops"]
+    assert describe("return", own) is METRICS["return"]
+    assert describe("eval/hops", own).about.startswith("the metric after the slash")
+    with pytest.raises(ValueError, match=r"unknown metric 'hop'; the closest known name is 'hops'"):
+        describe("hop", own)
+    with pytest.raises(ValueError, match="unknown metric 'hops'"):
+        describe("hops", {})

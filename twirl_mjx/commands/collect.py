@@ -11,6 +11,7 @@ from twirl_mjx.tasks.imitate import ImitateOptions
 from twirl_mjx.training import pipeline, rundir
 from twirl_mjx.training.config import TrainConfig
 from twirl_mjx.training.presets import starts_from_nominal_run
+from twirl_mjx.training.sinks.registry import resolve
 
 
 def main(argv: list[str]) -> int:
@@ -18,9 +19,10 @@ def main(argv: list[str]) -> int:
     options = parse_train(argv, "twirl collect")
     config = options.config
     check_source(config, options.preset)
+    sinks = resolve(options.log)
     name = options.name or rundir.default_name(config, options.preset)
     run_dir = rundir.RunDir(options.runs / rundir.check_name(name))
-    source = pipeline.find_source(config, options.preset, options.runs, say)
+    source = pipeline.find_source(config, options.preset, options.runs, say, sinks)
     with run_dir.exclusive():
         match run_dir.status(config, source.identity):
             case rundir.Foreign(error) | rundir.Busy(error):

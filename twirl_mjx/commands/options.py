@@ -34,6 +34,9 @@ class TrainOptions:
     """Name of the run; derived from task, variant, preset and seed by default."""
     runs: Path
     """Folder of all runs."""
+    log: tuple[str, ...]
+    """Where metrics go beside metrics.csv, TensorBoard and the terminal: wandb, trackio or a sink
+    of your own, FILE.py:NAME."""
     config: Annotated[TrainConfig, tyro.conf.arg(name="")]
 
 
@@ -47,9 +50,10 @@ def parse_train(argv: list[str], prog: str = "twirl train") -> TrainOptions:
     first.add_argument("--task", default=TrainConfig.task)
     first.add_argument("--preset", default=None)
     first.add_argument("--runs", default="runs")
+    first.add_argument("--learner", default=TrainConfig.learner)
     known, _ = first.parse_known_args(argv)
     preset = known.preset or default_preset()
-    config = make_config(known.task, preset)
+    config = make_config(known.task, preset, known.learner)
     shown = _shown(config)
     kind = dataclasses.make_dataclass(
         TrainOptions.__name__,
@@ -58,16 +62,17 @@ def parse_train(argv: list[str], prog: str = "twirl train") -> TrainOptions:
         frozen=True,
         namespace={"__doc__": TrainOptions.__doc__},
     )
-    found: Any = parse(kind, argv, prog, kind(preset, None, Path(known.runs), shown))
+    found: Any = parse(kind, argv, prog, kind(preset, None, Path(known.runs), (), shown))
     values = {f.name: getattr(found.config, f.name) for f in dataclasses.fields(TrainConfig)}
-    return TrainOptions(found.preset, found.name, found.runs, TrainConfig(**values))
+    return TrainOptions(found.preset, found.name, found.runs, found.log, TrainConfig(**values))
 
 
 def _shown(config: TrainConfig) -> TrainConfig:
-    """Return a config of a class that shows the options of its task under the task's name."""
+    """Return a config of a class that shows the options of its task and learner under their names."""
     sections = [("options", config.task, config.options)]
     if config.task_type.source:
         sections.append(("source_options", config.task_type.source, config.source_options))
+    sections.append(("droq", config.learner, config.droq))
     fields: list[Any] = [
         (field, Annotated[type(value), tyro.conf.arg(name=name)], dataclasses.field(default=value))
         for field, name, value in sections

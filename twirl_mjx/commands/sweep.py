@@ -18,8 +18,8 @@ from twirl_mjx.sweep.grid import Grid, grids_folder, load
 from twirl_mjx.sweep.scheduler import Progress, RayExecutor, run_all
 from twirl_mjx.sweep.table import SweepView, plan_table
 from twirl_mjx.sweep.worker import Job
-from twirl_mjx.training.progress import format_seconds
 from twirl_mjx.training.signals import stop_on_signal
+from twirl_mjx.training.sinks.terminal import format_seconds
 
 
 @dataclasses.dataclass(frozen=True)

@@ -10,6 +10,8 @@ from twirl_mjx.training import pipeline
 def main(argv: list[str]) -> int:
     """Train to the budget; see ``training.pipeline``."""
     options = parse_train(argv)
-    run_dir = pipeline.run(options.config, options.preset, options.runs, options.name, say)
+    run_dir = pipeline.run(
+        options.config, options.preset, options.runs, options.name, say, options.log
+    )
     say(f"done: {run_dir} (policy.npz, metrics.csv, eval.csv); film it: twirl render {run_dir}")
     return 0

@@ -62,8 +62,3 @@ class DroqConfig:
             raise ValueError(
                 f"droq.hidden_sizes = {self.hidden_sizes} needs sizes >= 1 (nearest: {nearest})"
             )
-
-    @property
-    def replay_ratio(self) -> float:
-        """Replayed rows per environment transition, ``utd * batch_size``."""
-        return self.utd * self.batch_size

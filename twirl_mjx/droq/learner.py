@@ -16,9 +16,9 @@ from twirl_mjx.droq import fast, losses, networks, plain
 from twirl_mjx.droq.config import DroqConfig
 from twirl_mjx.droq.networks import Params
 from twirl_mjx.droq.state import CriticState, DroqState, adam_init, adam_step
-from twirl_mjx.types import Metrics, Transition
+from twirl_mjx.types import Learner, MetricInfo, Metrics, Transition
 
-__all__ = ["DroqState", "init", "mean_action", "sample_action", "update"]
+__all__ = ["LEARNER", "DroqState", "init", "mean_action", "sample_action", "update"]
 
 
 def init(key: jax.Array, config: DroqConfig, obs_size: int, action_size: int) -> DroqState:
@@ -142,3 +142,18 @@ def actor_step(
         temperature_opt=temperature_opt,
     )
     return state, metrics
+
+
+METRICS = {
+    "critic_loss": MetricInfo("squared TD error, mean over ensemble and rows", "1"),
+    "actor_loss": MetricInfo("temperature * log_prob - mean critic value", "1"),
+    "temperature": MetricInfo("SAC's alpha, the weight of the entropy", "1"),
+    "q_mean": MetricInfo("critic value of the minibatch actions", "1"),
+    "target_q_mean": MetricInfo("TD target", "1"),
+    "critic_grad_norm": MetricInfo("Euclidean norm of the critic gradient", "1"),
+    "entropy": MetricInfo("policy entropy, -log_prob of sampled actions", "nat"),
+    "temperature_loss": MetricInfo("temperature * (entropy - target entropy)", "1"),
+}
+"""What ``update`` reports: means over critic updates, or values of the one actor update."""
+
+LEARNER = Learner("droq", DroqConfig, init, sample_action, mean_action, update, METRICS)

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 
 from twirl_mjx import records
 from twirl_mjx.checks import check_choice
+from twirl_mjx.droq.learner import LEARNER
 from twirl_mjx.policies import scripted
 from twirl_mjx.policies.clip import ClipPolicy
 from twirl_mjx.policies.function import from_policy
@@ -145,7 +146,8 @@ def options_of_card(header: PolicyHeader, origin: str) -> Any:
 
 def _act_of(loaded: NumpyPolicy | OnnxPolicy, noise: bool) -> ActOnObs:
     if isinstance(loaded, NumpyPolicy):
-        return actor_act(jax.tree.map(jnp.asarray, dict(loaded.actor_params)), noise=noise)
+        actor = jax.tree.map(jnp.asarray, dict(loaded.actor_params))
+        return actor_act(LEARNER, actor, noise=noise)
     return from_policy(loaded).on_observation
 
 

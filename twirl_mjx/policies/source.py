@@ -9,8 +9,8 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 
-from twirl_mjx.droq import learner as droq
 from twirl_mjx.tasks.observations import Observer
+from twirl_mjx.types import Learner
 
 ActOnObs = Callable[[jax.Array, jax.Array], jax.Array]
 """(observations [N, O], key) -> actions [N, 12]; traceable by jax."""
@@ -70,10 +70,10 @@ class ObservingSource:
         return self._act(obs, key), ObservedMemory(observer)
 
 
-def actor_act(actor: Any, *, noise: bool = False) -> ActOnObs:
-    """Return how a trained actor acts: its mean, or with ``noise`` as in training."""
+def actor_act(learner: Learner, actor: Any, *, noise: bool = False) -> ActOnObs:
+    """Return how a learner's actor acts: its mean, or with ``noise`` as in training."""
 
     def act(obs: jax.Array, key: jax.Array) -> jax.Array:
-        return droq.sample_action(actor, obs, key) if noise else droq.mean_action(actor, obs)
+        return learner.sample(actor, obs, key) if noise else learner.mean(actor, obs)
 
     return act

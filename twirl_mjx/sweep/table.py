@@ -15,7 +15,7 @@ from rich.text import Text
 from twirl_mjx.sweep.estimate import Estimate
 from twirl_mjx.sweep.plan import Cell, Status, reached_steps
 from twirl_mjx.sweep.scheduler import Progress
-from twirl_mjx.training.progress import format_count, format_seconds
+from twirl_mjx.training.sinks.terminal import format_count, format_seconds
 
 HEARTBEAT_S = 60.0
 """Time between two plain lines about running cells, s."""

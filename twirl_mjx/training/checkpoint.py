@@ -9,6 +9,7 @@ dataset.
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -82,10 +83,14 @@ class Checkpoints:
     """The checkpoints of one run directory."""
 
     def __init__(self, run_dir: Path) -> None:
-        """Open (and create) ``run_dir/checkpoints``."""
+        """Open (and create) ``run_dir/checkpoints``; leftovers of a killed save are deleted."""
         self._root = (run_dir / "checkpoints").resolve()
         self._replay = self._root / "replay"
         self._replay.mkdir(parents=True, exist_ok=True)
+        for folder in self._root.glob("orbax/*.orbax-checkpoint-tmp*"):  # left by a killed save
+            shutil.rmtree(folder)
+        for file in self._replay.glob("*.partial"):
+            file.unlink()
         self._manager = ocp.CheckpointManager(
             self._root / "orbax",
             item_names=("policy", "train_state", "progress"),

@@ -12,6 +12,7 @@ from twirl_mjx.checks import check_choice, check_range
 from twirl_mjx.droq.config import DroqConfig
 from twirl_mjx.replay.config import ReplayConfig
 from twirl_mjx.tasks.registry import TASKS
+from twirl_mjx.training.learners import LEARNERS
 from twirl_mjx.worlds.config import WorldConfig, world_fields
 
 Variant = Literal["scratch", "twirl", "twirl+weights", "weights", "zero-shot"]
@@ -64,8 +65,10 @@ class TrainConfig(WorldConfig):
     """Environment transitions to gather."""
     warmup_env_steps: int = 1000
     """Transitions with uniformly random actions before the first update."""
-    droq: DroqConfig = DroqConfig()
-    """The learner."""
+    learner: str = "droq"
+    """Name of the learner, or file.py:NAME of your own."""
+    droq: Any = DroqConfig()
+    """Settings of the learner, under its own name on the command line."""
     replay: ReplayConfig = ReplayConfig()
     """The mixed replay."""
     eval: EvalConfig = EvalConfig()
@@ -82,6 +85,19 @@ class TrainConfig(WorldConfig):
             ValueError: With the numbers and the nearest valid choice.
         """
         super().__post_init__()
+        for reference in self.uses:
+            LEARNERS.admit_if_fits(reference)
+        self._set("learner", LEARNERS.admit(self.learner))
+        if reference := LEARNERS.reference(self.learner):
+            self._set("uses", tuple(sorted({*self.uses, reference})))
+        settings = LEARNERS.get(self.learner).Config
+        if type(self.droq) is not settings:
+            if self.droq != DroqConfig():
+                raise ValueError(
+                    f"learner {self.learner} has settings of {settings.__name__}, not"
+                    f" {type(self.droq).__name__}"
+                )
+            self._set("droq", settings())
         if self.task in (names := tuple(field.name for field in dataclasses.fields(self))):
             raise ValueError(
                 f"task {self.task!r} has the name of a field of a run's config, where its options"

@@ -15,6 +15,7 @@ from twirl_mjx import records
 from twirl_mjx.checks import check_choice
 from twirl_mjx.tasks.registry import TASKS
 from twirl_mjx.training.config import TrainConfig
+from twirl_mjx.training.learners import LEARNERS
 
 
 def flatten(config: TrainConfig) -> dict[str, Any]:
@@ -22,7 +23,7 @@ def flatten(config: TrainConfig) -> dict[str, Any]:
     out: dict[str, Any] = {}
     for field in dataclasses.fields(config):
         value = getattr(config, field.name)
-        prefix = _sections(config.task).get(field.name, field.name)
+        prefix = _sections(config.task, config.learner).get(field.name, field.name)
         if dataclasses.is_dataclass(value):
             out |= {f"{prefix}.{key}": inner for key, inner in records.flatten(value).items()}
         elif field.name not in ("options", "source_options"):
@@ -30,9 +31,9 @@ def flatten(config: TrainConfig) -> dict[str, Any]:
     return out
 
 
-def _sections(task: str) -> dict[str, str | None]:
-    """Return under which name the options of a task, and of its source's, stand."""
-    return {"options": task, "source_options": TASKS.get(task).source}
+def _sections(task: str, learner: str) -> dict[str, str | None]:
+    """Return under which name the options of a task, of its source's, of a learner stand."""
+    return {"options": task, "source_options": TASKS.get(task).source, "droq": learner}
 
 
 def nest(flat: Mapping[str, Any]) -> dict[str, Any]:
@@ -83,21 +84,25 @@ def from_dict(record: Any) -> TrainConfig:
     values = dict(record)
     task = values.get("task", TrainConfig.task)
     records.check_type("task", task, str)
+    learner = values.get("learner", TrainConfig.learner)
+    records.check_type("learner", learner, str)
     for reference in values.get("uses", ()):
         TASKS.admit_if_fits(reference)
+        LEARNERS.admit_if_fits(reference)
     task = values["task"] = TASKS.admit(task)
-    for field, name in _sections(task).items():
-        if name is not None:
-            kind = TASKS.get(name).Options
-            given = values.pop(name, {})
-            values[field] = records.from_dict(kind, given, f"config.{name}")
-    names = {field.name for field in dataclasses.fields(TrainConfig)}
-    given = set(values) & {"options", "source_options"}
-    public = sorted(names - {"options", "source_options"})
-    sections = [name for name in _sections(task).values() if name]
-    for key in values.keys() - given:
-        check_choice("key in config", key, (*public, *sections))
-    return records.from_dict(TrainConfig, values)
+    learner = values["learner"] = LEARNERS.admit(learner)
+    sections = _sections(task, learner)
+    kinds = {name: TASKS.get(name).Options for f, name in sections.items() if f != "droq" and name}
+    kinds[learner] = LEARNERS.get(learner).Config
+    names = [field.name for field in dataclasses.fields(TrainConfig) if field.name not in sections]
+    for key in values:
+        check_choice("key in config", key, (*names, *kinds))
+    parts = {
+        field: records.from_dict(kinds[name], values.pop(name, {}), f"config.{name}")
+        for field, name in sections.items()
+        if name is not None
+    }
+    return records.from_dict(TrainConfig, values | parts)
 
 
 def settle(config: TrainConfig, settings: Mapping[str, Any]) -> TrainConfig:
@@ -130,7 +135,8 @@ def departures(config: TrainConfig) -> dict[str, Any]:
     What identifies a run: a field that a later version adds, at its default, changes nothing, nor
     does the place of a user's file.
     """
-    default = flatten(TrainConfig(task=config.task, uses=config.uses)) | {"task": TrainConfig.task}
+    default = flatten(TrainConfig(task=config.task, learner=config.learner, uses=config.uses))
+    default |= {"task": TrainConfig.task, "learner": TrainConfig.learner}
     return {key: value for key, value in flatten(config).items() if value != default[key]}
 
 
@@ -138,7 +144,7 @@ def _from_version_0_1(record: dict[str, Any]) -> dict[str, Any]:
     """Return a config of version 0.1, which held the options of four tasks, in today's form."""
     env = record["env"]
     task = record["task"]
-    sections = {name for name in _sections(task).values() if name}
+    sections = {name for name in _sections(task, "droq").values() if name}
     others = {"stand", "biped", "imitate", "hurdles"} - sections
     new = {key: value for key, value in record.items() if key not in {"env", *others}}
     if "stand" in sections:  # its goals were those of the other upright task

@@ -7,7 +7,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from twirl_mjx.droq.state import DroqState
 from twirl_mjx.training.state import TrainState
 
 
@@ -20,7 +19,7 @@ def _finite(tree: Any) -> Any:
     return jax.tree.map(lambda x: jnp.all(jnp.isfinite(x)), tree)
 
 
-def check_finite(learner: DroqState) -> None:
+def check_finite(learner: Any) -> None:
     """Check that every number of the learner is finite.
 
     Raises:

@@ -6,7 +6,7 @@ import dataclasses
 import math
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,21 +14,22 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from twirl_mjx.droq import learner as droq
-from twirl_mjx.droq.state import DroqState
-from twirl_mjx.evaluation.rollout import make_evaluate
+from twirl_mjx.evaluation.rollout import ActFn, make_evaluate
 from twirl_mjx.policies.learned import NumpyPolicy, PolicyHeader, load_policy, save_policy
 from twirl_mjx.replay.ring import RingBuffer
-from twirl_mjx.tasks.measures import episode_means
+from twirl_mjx.tasks.measures import episode_means, measures_of
 from twirl_mjx.tasks.observations import layout_slices
-from twirl_mjx.training import rundir, state
+from twirl_mjx.training import config_json, rundir, state
 from twirl_mjx.training.checkpoint import Checkpoints
 from twirl_mjx.training.config import TrainConfig
 from twirl_mjx.training.guards import check_experience, check_finite
-from twirl_mjx.training.metrics import RunLogger
+from twirl_mjx.training.learners import check_learner, learner_of
+from twirl_mjx.training.logger import RunLogger
 from twirl_mjx.training.rundir import RunDir
 from twirl_mjx.training.signals import stop_on_signal
+from twirl_mjx.training.sinks.base import RunInfo, Sink
 from twirl_mjx.training.state import TrainState
+from twirl_mjx.types import Learner, MetricInfo
 from twirl_mjx.worlds.make import make_env
 from twirl_mjx.worlds.vector import VectorEnv
 
@@ -44,9 +45,13 @@ class Outcome:
     """Mean measures of the closing evaluation of the best policy; empty unless finished."""
 
 
-def act_mean(params: Any, memory: Any, env_state: Any, key: jax.Array) -> tuple[jax.Array, Any]:
-    """Act deterministically with actor parameters; an ``ActFn`` without memory."""
-    return droq.mean_action(params, env_state.obs), memory
+def act_mean(learner: Learner) -> ActFn:
+    """Return how a learner's actor acts in evaluation: deterministically, without memory."""
+
+    def act(params: Any, memory: Any, env_state: Any, key: jax.Array) -> tuple[jax.Array, Any]:
+        return learner.mean(params, env_state.obs), memory
+
+    return act
 
 
 def no_memory(env_state: Any) -> tuple[()]:
@@ -78,10 +83,16 @@ class Run:
     def __init__(
         self, config: TrainConfig, run_dir: RunDir, source: RingBuffer | None, stage: str
     ) -> None:
-        """Build (not compile) everything."""
+        """Build (not compile) everything.
+
+        Raises:
+            ValueError: A function of the learner does not do what ``types.Learner`` says.
+        """
         self.config = config
         self.run_dir = run_dir
         self.env = make_env(config)
+        check_learner(config.droq, self.env.observation_size, self.env.action_size)
+        self.replay_ratio = config.droq.utd * config.droq.batch_size
         self.checkpoints = Checkpoints(run_dir.path)
         self.stage = stage
         self.source = source
@@ -90,10 +101,24 @@ class Run:
         self.took_weights = False
         self.progress: dict[str, Any] = {"best": -math.inf, "wall_s": 0.0, "inserted": 0}
         env = make_env(config.evaluation)
-        self._evaluate = make_evaluate(env, no_memory, act_mean)
+        self._evaluate = make_evaluate(env, no_memory, act_mean(learner_of(config.droq)))
         self._epoch = state.compile_epoch(config, self.env)
 
-    def start(self, initial: Callable[[DroqState], DroqState] | None) -> TrainState:
+    def info(self) -> RunInfo:
+        """Return what sinks are told; call it after :meth:`start`, which may resume."""
+        measures = measures_of(self.env.task).items()
+        return RunInfo(
+            directory=self.run_dir.path,
+            identity=self.run_dir.identity(self.config),
+            total_env_steps=self.config.total_env_steps,
+            stage=self.stage,
+            resume_env_steps=self.resumed_at,
+            measures={name: MetricInfo(measure.about, measure.unit) for name, measure in measures},
+            learning=learner_of(self.config.droq).metrics,
+            config=config_json.flatten(self.config),
+        )
+
+    def start(self, initial: Callable[[Any], Any] | None) -> TrainState:
         """Return the state to begin or resume from.
 
         Args:
@@ -133,7 +158,7 @@ class Run:
             "shift": self.config.shift,
             "env_steps": int(train_state.env_steps),
             "grad_steps": int(train_state.learner.grad_steps),
-            "replay_ratio": self.config.droq.replay_ratio,
+            "replay_ratio": self.replay_ratio,
             "wall_s": round(self.progress["wall_s"], 1),
             "options": dataclasses.asdict(self.config.options),
             "evaluation": means,
@@ -169,7 +194,7 @@ class Run:
             else:
                 train_state, metrics = self._epoch(train_state)
             values = {name: float(value) for name, value in metrics.items()}
-            values |= {"replay_ratio": config.droq.replay_ratio, "source_rows": self.source_rows}
+            values |= {"replay_ratio": self.replay_ratio, "source_rows": self.source_rows}
             check_finite(train_state.learner)
             check_experience(train_state)
             self.progress["wall_s"] = before + time.monotonic() - began
@@ -192,8 +217,9 @@ def train(
     run_dir: RunDir,
     *,
     source: RingBuffer | None = None,
-    initial: Callable[[DroqState], DroqState] | None = None,
+    initial: Callable[[Any], Any] | None = None,
     stage: str = "train",
+    sinks: Sequence[Sink] = (),
 ) -> Outcome:
     """Train (or resume) one run to its budget.
 
@@ -203,6 +229,7 @@ def train(
         source: Frozen source experience; needed when ``config.uses_source_data``.
         initial: Changes the fresh learner before the first transition.
         stage: Name shown with the progress.
+        sinks: Where metrics go beside ``metrics.csv``, TensorBoard and the terminal.
 
     Raises:
         DivergedError: The learner is no longer finite.
@@ -215,16 +242,7 @@ def train(
     try:
         train_state = run.start(initial)
         steps = run.resumed_at or 0
-        with (
-            stop_on_signal() as stop,
-            RunLogger(
-                run_dir.path,
-                run_dir.identity(config),
-                config.total_env_steps,
-                stage,
-                run.resumed_at,
-            ) as logger,
-        ):
+        with stop_on_signal() as stop, RunLogger(run.info(), sinks) as logger:
             if steps:
                 logger.announce(f"resuming {run_dir.name} at {steps:,} transitions")
             train_state = run.loop(train_state, logger, stop)
@@ -250,7 +268,7 @@ def final_evaluation(config: TrainConfig, run_dir: RunDir, env_steps: int) -> di
     assert isinstance(policy, NumpyPolicy), "a run writes .npz policies"
     actor = jax.tree.map(jnp.asarray, dict(policy.actor_params))
     env = make_env(config.evaluation, num_envs=config.eval.final_episodes)
-    evaluate = make_evaluate(env, no_memory, act_mean)
+    evaluate = make_evaluate(env, no_memory, act_mean(learner_of(config.droq)))
     values = evaluate(actor, jax.random.key(config.eval.seed + 1))
     run_dir.write_episodes(config, env_steps, values)
     return episode_means(values)

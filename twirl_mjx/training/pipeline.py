@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +27,8 @@ from twirl_mjx.training.checkpoint import has_checkpoint, load_replay
 from twirl_mjx.training.config import TrainConfig
 from twirl_mjx.training.presets import make_config
 from twirl_mjx.training.rundir import Busy, Finished, Foreign, RunDir
+from twirl_mjx.training.sinks.base import Sink
+from twirl_mjx.training.sinks.registry import resolve
 from twirl_mjx.training.source import collect
 from twirl_mjx.training.weights import check_weights_fit, source_weights
 from twirl_mjx.worlds.make import make_env
@@ -47,6 +49,7 @@ def run(
     name: str | None,
     say: Say,
     source: Source | None = None,
+    sinks: Sequence[str | Sink] = (),
 ) -> RunDir:
     """Train a task to its budget, with every stage before it that is missing.
 
@@ -57,6 +60,7 @@ def run(
         name: Name of the run; derived from the config by default.
         say: Prints one line for a person.
         source: The source itself, instead of what ``config.source`` says.
+        sinks: Where metrics go beside the usual three, by name or as objects; see ``sinks``.
 
     Returns:
         The run directory.
@@ -67,13 +71,14 @@ def run(
         RunMismatchError: Another run lives there, or a finished one that cannot go on.
         RunBusyError: Another process works in the run directory.
     """
+    sinks = resolve(sinks)
     run_dir = RunDir(runs_dir / rundir.check_name(name or rundir.default_name(config, preset)))
     check_early(config, preset, run_dir, source)
     if config.variant != "scratch" and source is None:
         if _outlived_its_source(config, preset, runs_dir, run_dir):
             say(f"{run_dir} is finished; its source is no longer there to compare")
             return run_dir
-        source = find_source(config, preset, runs_dir, say)
+        source = find_source(config, preset, runs_dir, say, sinks)
     with run_dir.exclusive():
         match run_dir.status(config, source.identity if source else None):
             case Foreign(error) | Busy(error):
@@ -81,11 +86,11 @@ def run(
             case Finished():
                 say(f"{run_dir} is finished")
             case _ if source is None:
-                _train(config, run_dir, None, None)
+                _train(config, run_dir, None, None, sinks)
             case _ if config.variant == "zero-shot":
                 zero_shot(config, run_dir, source, say)
             case _:
-                _train_from(config, run_dir, source, say)
+                _train_from(config, run_dir, source, say, sinks)
     return run_dir
 
 
@@ -126,12 +131,14 @@ def _outlived_its_source(config: TrainConfig, preset: str, runs_dir: Path, run_d
             return not _nominal_dir(config, preset, runs_dir).path.exists()
 
 
-def _train_from(config: TrainConfig, run_dir: RunDir, source: Source, say: Say) -> None:
+def _train_from(
+    config: TrainConfig, run_dir: RunDir, source: Source, say: Say, sinks: Sequence[Sink]
+) -> None:
     fresh_weights = config.uses_source_weights and not has_checkpoint(run_dir.path)
     initial = source_weights(config, source, say) if fresh_weights else None
     run_dir.open(config, source.identity)
     data = source_data(config, run_dir, source, say) if config.uses_source_data else None
-    _train(config, run_dir, data, initial)
+    _train(config, run_dir, data, initial, sinks)
 
 
 def _train(
@@ -139,13 +146,22 @@ def _train(
     run_dir: RunDir,
     data: ring.RingBuffer | None,
     initial: Callable[[DroqState], DroqState] | None,
+    sinks: Sequence[Sink],
 ) -> None:
-    outcome = loop.train(config, run_dir, source=data, initial=initial, stage=config.task)
+    outcome = loop.train(
+        config, run_dir, source=data, initial=initial, stage=config.task, sinks=sinks
+    )
     if not outcome.finished:
         raise StoppedError(f"{run_dir.name} stopped at {outcome.env_steps:,} transitions")
 
 
-def find_source(config: TrainConfig, preset: str, runs_dir: Path, say: Say) -> Source:
+def find_source(
+    config: TrainConfig,
+    preset: str,
+    runs_dir: Path,
+    say: Say,
+    sinks: Sequence[Sink] = (),
+) -> Source:
     """Return the source of a run (``source_rules`` says which), training it when it is missing.
 
     Raises:
@@ -173,7 +189,7 @@ def find_source(config: TrainConfig, preset: str, runs_dir: Path, say: Say) -> S
         case source_rules.RunOf(first):
             run_dir = runs_dir / rundir.default_name(first, preset)
             say(f"stage 1 of 3: source policy, task {first.task}, in {run_dir}")
-            return at(run(first, preset, runs_dir, None, say).path)
+            return at(run(first, preset, runs_dir, None, say, sinks=sinks).path)
 
 
 def no_such_source(path: Path, runs_dir: Path) -> str:

@@ -8,7 +8,7 @@ from typing import Any
 from twirl_mjx.checks import check_choice
 from twirl_mjx.tasks.registry import TASKS
 from twirl_mjx.training.config import TrainConfig
-from twirl_mjx.training.config_json import settle
+from twirl_mjx.training.config_json import flatten, settle
 
 SETTINGS: dict[str, Mapping[str, Any]] = {
     "paper": {},
@@ -55,27 +55,44 @@ def default_preset() -> str:
     return "cpu" if jax.default_backend() == "cpu" else "paper"
 
 
-def make_config(task: str, preset: str = "paper") -> TrainConfig:
+def make_config(
+    task: str, preset: str = "paper", learner: str = TrainConfig.learner
+) -> TrainConfig:
     """Return the config of a task under a preset.
 
     Args:
         task: Name of a task, or ``file.py:Name``.
         preset: ``paper`` (the paper's numbers), ``cpu`` (the same method, settings for two CPU
             cores) or ``debug`` (seconds, for tests).
+        learner: Name of the learner, or ``file.py:NAME``; of DroQ's settings in a preset it takes
+            those that it has too.
 
     Raises:
-        ValueError: Unknown task or preset, with the nearest valid name.
+        ValueError: Unknown task, preset or learner, with the nearest valid name.
     """
     name = TASKS.admit(task)
     check_choice("preset", preset, PRESETS)
     kind = TASKS.get(name)
     variant = "twirl" if kind.source else "scratch"
-    config = TrainConfig(task=name, variant=variant)
+    config = TrainConfig(task=name, variant=variant, learner=learner)
     if kind.source:
-        source = make_config(kind.source, preset)
+        source = make_config(kind.source, preset, learner)
         config = settle(config, {f"{kind.source}.{k}": v for k, v in vars(source.options).items()})
     own = dict(kind.presets.get("paper", {})) | dict(kind.presets.get(preset, {}))
-    return settle(config, dict(SETTINGS[preset]) | own)
+    settings = dict(SETTINGS[preset]) | own
+    if config.learner != TrainConfig.learner:
+        settings = _of_learner(config, settings)
+    return settle(config, settings)
+
+
+def _of_learner(config: TrainConfig, settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Return settings with DroQ's handed to another learner, as far as it has them."""
+    known, own = flatten(config), f"{TrainConfig.learner}."
+    renamed = {
+        f"{config.learner}.{name.removeprefix(own)}" if name.startswith(own) else name: value
+        for name, value in settings.items()
+    }
+    return {name: value for name, value in renamed.items() if name in known}
 
 
 def source_task_of(config: TrainConfig) -> str:

@@ -104,7 +104,7 @@ def source_of(config: TrainConfig, preset: str) -> NominalRun | Scripted | AtPat
     if config.source not in ("auto", "train"):
         return AtPath(Path(config.source))
     task = source_task_of(config)
-    plain = make_config(task, preset)
+    plain = make_config(task, preset, config.learner)
     options = config.source_options
     if config.source == "auto" and preset != "debug" and options == plain.options:
         try:

@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
+from typing import Any
 
 import flax.struct
 import jax
 import jax.numpy as jnp
 
-from twirl_mjx.droq import learner as droq
-from twirl_mjx.droq.state import DroqState
 from twirl_mjx.replay import mixed, ring
 from twirl_mjx.replay.mixed import MixedReplay
 from twirl_mjx.tasks import measures
 from twirl_mjx.tasks.measures import Tracker
 from twirl_mjx.training.config import TrainConfig
+from twirl_mjx.training.learners import learner_of
 from twirl_mjx.types import Metrics
 from twirl_mjx.worlds.vector import EnvState, VectorEnv, make_transition
 
@@ -23,8 +23,8 @@ from twirl_mjx.worlds.vector import EnvState, VectorEnv, make_transition
 class TrainState(flax.struct.PyTreeNode):
     """Everything a run needs to go on; one pytree, one donated argument."""
 
-    learner: DroqState
-    """Networks, optimisers, temperature, critic updates so far."""
+    learner: Any
+    """State of the learner, see ``types.Learner``; DroQ's is ``droq.state.DroqState``."""
     env: EnvState
     """All worlds."""
     replay: MixedReplay
@@ -62,7 +62,9 @@ def init(
     """
     learner_key, env_key, key = jax.random.split(key, 3)
     return TrainState(
-        learner=droq.init(learner_key, config.droq, env.observation_size, env.action_size),
+        learner=learner_of(config.droq).init(
+            learner_key, config.droq, env.observation_size, env.action_size
+        ),
         env=env.reset(env_key),
         replay=MixedReplay(
             source=source,
@@ -84,7 +86,7 @@ def collect_step(
     begins with the weights of a source.
     """
     warm_key, act_key = jax.random.split(key)
-    action = droq.sample_action(state.learner.actor, state.env.obs, act_key)
+    action = learner_of(config.droq).sample(state.learner.actor, state.env.obs, act_key)
     if not config.uses_source_weights:
         warm = jax.random.uniform(warm_key, action.shape, minval=-1.0, maxval=1.0)
         action = jnp.where(state.env_steps < config.warmup_env_steps, warm, action)
@@ -101,9 +103,7 @@ def collect_step(
     return state, result
 
 
-def update_blocks(
-    config: TrainConfig, state: TrainState, key: jax.Array
-) -> tuple[DroqState, Metrics]:
+def update_blocks(config: TrainConfig, state: TrainState, key: jax.Array) -> tuple[Any, Metrics]:
     """Run all blocks of critic updates that follow one vector step; none during warm-up.
 
     A loop with a trip count, not a ``lax.cond``, decides: a conditional would copy the rings.
@@ -113,7 +113,7 @@ def update_blocks(
     """
     keys = jax.random.split(key, config.blocks_per_step)
 
-    def block(learner: DroqState, block_key: jax.Array) -> tuple[DroqState, Metrics]:
+    def block(learner: Any, block_key: jax.Array) -> tuple[Any, Metrics]:
         sample_key, update_key = jax.random.split(block_key)
         minibatches = mixed.sample(
             state.replay,
@@ -122,9 +122,9 @@ def update_blocks(
             batch_size=config.droq.batch_size,
             phi=config.effective_phi,
         )
-        return droq.update(learner, config.droq, minibatches, update_key)
+        return learner_of(config.droq).update(learner, config.droq, minibatches, update_key)
 
-    def body(i: jax.Array, carry: tuple[DroqState, Metrics]) -> tuple[DroqState, Metrics]:
+    def body(i: jax.Array, carry: tuple[Any, Metrics]) -> tuple[Any, Metrics]:
         learner, metrics = block(carry[0], keys[i])
         return learner, jax.tree.map(jnp.add, carry[1], metrics)
 

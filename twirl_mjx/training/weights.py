@@ -7,6 +7,7 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 
+from twirl_mjx.droq.learner import LEARNER
 from twirl_mjx.droq.state import DroqState
 from twirl_mjx.policies.learned import NumpyPolicy, hidden_layers
 from twirl_mjx.policies.resolve import Source, config_of_source
@@ -14,6 +15,7 @@ from twirl_mjx.tasks.observations import Entry
 from twirl_mjx.tasks.registry import TASKS
 from twirl_mjx.training.checkpoint import load_learner
 from twirl_mjx.training.config import TrainConfig
+from twirl_mjx.training.learners import learner_of
 from twirl_mjx.training.presets import source_task_of
 from twirl_mjx.training.source_rules import AtPath, RunOf, source_of
 
@@ -22,10 +24,15 @@ def check_weights_fit(config: TrainConfig, preset: str) -> None:
     """Refuse a variant that needs the networks of a source that cannot fit, before any stage.
 
     Raises:
-        ValueError: The default source observes differently.
+        ValueError: The default source observes differently, or the learner is not DroQ.
     """
     if not config.uses_source_weights:
         return
+    if (learner := learner_of(config.droq)) is not LEARNER:
+        raise ValueError(
+            f"variant {config.variant!r} takes over the networks of {LEARNER.name}, not those of"
+            f" learner {learner.name} (nearest variant: 'twirl')"
+        )
     match source_of(config, preset):
         case AtPath(is_shipped=True) | RunOf():
             task = source_task_of(config)

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 import time
 from collections import deque
+from collections.abc import Mapping
 
 from rich.console import Console, Group, RenderableType
 from rich.live import Live
@@ -14,42 +14,27 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-HEADLINES = (
-    ("env_steps_per_s", "env steps/s", "{:.0f}"),
-    ("updates_per_s", "updates/s", "{:.0f}"),
-    ("return", "return", "{:.1f}"),
-    ("episode_length", "length", "{:.0f}"),
-    ("standing_time", "standing", "{:.1f} s"),
-    ("min_distance", "min distance", "{:.2f} m"),
-    ("hurdles_passed", "hurdles", "{:.2f}"),
-    ("temperature", "alpha", "{:.3g}"),
-    ("q_mean", "Q", "{:.3g}"),
-    ("critic_loss", "critic loss", "{:.3g}"),
-    ("actor_loss", "actor loss", "{:.3g}"),
-    ("eval/return", "eval return", "{:.1f}"),
-    ("eval/standing_time", "eval standing", "{:.1f} s"),
-    ("eval/min_distance", "eval distance", "{:.2f} m"),
-    ("eval/hurdles_passed", "eval hurdles", "{:.2f}"),
-    ("dropped_transitions", "dropped", "{:.0f}"),
-)
-"""Metrics shown while a run goes on: name, label and format."""
+from twirl_mjx.training.metrics import METRICS
+from twirl_mjx.training.sinks.base import RunInfo
+from twirl_mjx.types import MetricInfo
 
+TRAINING = {
+    "env_steps_per_s": ("env steps/s", "{:.0f}"),
+    "updates_per_s": ("updates/s", "{:.0f}"),
+    "return": ("return", "{:.1f}"),
+    "episode_length": ("length", "{:.0f}"),
+}
+"""Headlines before those of the task: label and format."""
+RETURN = {"eval/return": ("eval return", "{:.1f}")}
+DROPPED = {"dropped_transitions": ("dropped", "{:.0f}")}
+FORMATS = {"1": "{:.3g}", "s": "{:.1f} s", "m": "{:.2f} m", "share": "{:.0%}"}
+"""How a number is written, by its unit; any other unit stands behind three digits."""
+SHOWN_MEASURES = 3
+"""Measures of a task that are shown: the first it declares beside the common ones."""
+SHOWN_LEARNING = 4
+"""Metrics of a learner that are shown: the first it declares."""
 RATE_WINDOW = 20
 """Epochs over which the remaining time is estimated."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Snapshot:
-    """One reported epoch."""
-
-    env_steps: int
-    """Transitions gathered so far."""
-    grad_steps: int
-    """Critic updates so far."""
-    wall_s: float
-    """Time since the stage began, s."""
-    values: dict[str, float]
-    """Metric name to value."""
 
 
 def format_count(number: float) -> str:
@@ -68,41 +53,48 @@ def format_seconds(seconds: float | None) -> str:
     return f"{whole // 3600}:{whole // 60 % 60:02d}:{whole % 60:02d}"
 
 
-def headline_texts(values: dict[str, float]) -> list[tuple[str, str]]:
-    """Return (label, text) of the headline metrics that are known."""
-    return [
-        (label, form.format(values[name]))
-        for name, label, form in HEADLINES
-        if name in values and not math.isnan(values[name])
-    ]
+def headlines(run: RunInfo) -> dict[str, tuple[str, str]]:
+    """Return label and format of the metrics shown while a run goes on, in their order."""
+
+    def written(metrics: Mapping[str, MetricInfo], most: int) -> dict[str, tuple[str, str]]:
+        own = [name for name in metrics if name not in METRICS][:most]
+        return {
+            name: (name.replace("_", " "), FORMATS.get(unit, f"{{:.3g}} {unit}"))
+            for name, unit in ((name, metrics[name].unit) for name in own)
+        }
+
+    task = written(run.measures, SHOWN_MEASURES)
+    evaluated = {f"eval/{name}": (f"eval {label}", form) for name, (label, form) in task.items()}
+    learning = written(run.learning, SHOWN_LEARNING)
+    return TRAINING | task | learning | RETURN | evaluated | DROPPED
 
 
-class ProgressView:
-    """Shows one stage of a run."""
+class Terminal:
+    """A live panel on a terminal, one plain line for each epoch elsewhere."""
 
-    def __init__(self, console: Console, stage: str, run: str, total_env_steps: int) -> None:
-        self._console, self._stage, self._run = console, stage, run
-        self._total = max(total_env_steps, 1)
-        self._env_steps = self._grad_steps = 0
-        self._values: dict[str, float] = {}
-        self._history: deque[tuple[float, int]] = deque(maxlen=RATE_WINDOW)
-        self._busy: tuple[str, float] | None = None
+    def __init__(self, console: Console) -> None:
+        self._console = console
         self._live: Live | None = None
+        self._busy: tuple[str, float] | None = None
 
-    def start(self, env_steps: int) -> None:
-        """Begin at ``env_steps`` transitions."""
-        self._env_steps = env_steps
-        self._history.append((time.monotonic(), env_steps))
+    def open(self, run: RunInfo) -> None:
+        """Begin to show a stage."""
+        self._stage, self._run = run.stage, run.identity["run"]
+        self._total = max(run.total_env_steps, 1)
+        self._headlines = headlines(run)
+        self._values: dict[str, float] = {}
+        self._env_steps, self._grad_steps = run.resume_env_steps or 0, 0
+        self._history = deque([(time.monotonic(), self._env_steps)], maxlen=RATE_WINDOW)
         if self._console.is_terminal:
             self._live = Live(
                 console=self._console, get_renderable=self._render, refresh_per_second=2
             )
             self._live.start()
         else:
-            begin = f" from {format_count(env_steps)}" if env_steps else ""
+            begin = f" from {format_count(self._env_steps)}" if self._env_steps else ""
             self.announce(f"{self._stage} {self._run}: to {format_count(self._total)}{begin}")
 
-    def stop(self) -> None:
+    def close(self) -> None:
         """End the live display and leave its last state on the screen."""
         if self._live is not None:
             self._live.stop()
@@ -118,13 +110,15 @@ class ProgressView:
         if text and self._live is None:
             self.announce(text)
 
-    def update(self, snapshot: Snapshot) -> None:
+    def log(
+        self, env_steps: int, grad_steps: int, wall_s: float, values: Mapping[str, float]
+    ) -> None:
         """Take over one epoch."""
-        self._env_steps, self._grad_steps = snapshot.env_steps, snapshot.grad_steps
-        self._values |= {k: v for k, v in snapshot.values.items() if not math.isnan(v)}
-        if "compile_s" in snapshot.values:  # says nothing about the epochs to come
+        self._env_steps, self._grad_steps = env_steps, grad_steps
+        self._values |= values
+        if "compile_s" in values:  # says nothing about the epochs to come
             self._history.clear()
-        self._history.append((time.monotonic(), snapshot.env_steps))
+        self._history.append((time.monotonic(), env_steps))
         if self._live is None:
             self.announce(self.line())
 
@@ -143,9 +137,17 @@ class ProgressView:
             f"env {format_count(self._env_steps)}",
             f"updates {format_count(self._grad_steps)}",
             f"eta {format_seconds(self.eta())}",
-            *(f"{label} {text}" for label, text in headline_texts(self._values)),
+            *(f"{label} {text}" for label, text in self._texts()),
         ]
         return " | ".join(parts)
+
+    def _texts(self) -> list[tuple[str, str]]:
+        """Return (label, text) of the headlines that are known."""
+        return [
+            (label, form.format(self._values[name]))
+            for name, (label, form) in self._headlines.items()
+            if name in self._values
+        ]
 
     def _render(self) -> RenderableType:
         """Build the live panel."""
@@ -163,10 +165,7 @@ class ProgressView:
             ),
         )
         body = Table.grid(expand=True, padding=(0, 2))
-        cells = [
-            Text.assemble((f"{label} ", "dim"), text)
-            for label, text in headline_texts(self._values)
-        ]
+        cells = [Text.assemble((f"{label} ", "dim"), text) for label, text in self._texts()]
         for start in range(0, len(cells), 4):
             body.add_row(*cells[start : start + 4], *[Text()] * (4 - len(cells[start : start + 4])))
         parts: list[RenderableType] = [head, body]

@@ -1,0 +1,1 @@
+"""Where the metrics of a run go: the table, TensorBoard, the terminal, and what a user adds."""

@@ -1,0 +1,81 @@
+"""The tidy ``metrics.csv``."""
+
+from __future__ import annotations
+
+import csv
+import io
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TextIO
+
+from twirl_mjx.training.sinks.base import IDENTITY, RunInfo
+
+CSV_NAME = "metrics.csv"
+COLUMNS = (*IDENTITY, "metric", "env_steps", "grad_steps", "wall_s", "value")
+"""Columns of ``metrics.csv``, one row per metric and epoch."""
+
+
+class Table:
+    """Appends to ``metrics.csv``, every epoch forced to disk."""
+
+    def open(self, run: RunInfo) -> None:
+        """Open the table: from the resumed checkpoint on, or anew.
+
+        Raises:
+            ValueError: A table with other columns lies there.
+        """
+        path = run.directory / CSV_NAME
+        resumes = run.resume_env_steps is not None and path.exists()
+        self.earlier_s = truncate_csv(path, run.resume_env_steps or 0) if resumes else 0.0
+        """``wall_s`` of the last row kept."""
+        self._identity = [run.identity[name] for name in IDENTITY]
+        self._file: TextIO = path.open("a" if resumes else "w", newline="")
+        self._csv = csv.writer(self._file, lineterminator="\n")
+        if not resumes:
+            self._csv.writerow(COLUMNS)
+            self._sync()
+
+    def log(
+        self, env_steps: int, grad_steps: int, wall_s: float, values: Mapping[str, float]
+    ) -> None:
+        """Append one row for each value."""
+        for name, value in values.items():
+            tail = [name, env_steps, grad_steps, f"{wall_s:.3f}", f"{value:.9g}"]
+            self._csv.writerow([*self._identity, *tail])
+        self._sync()
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+    def _sync(self) -> None:
+        self._file.flush()
+        os.fsync(self._file.fileno())
+
+
+def truncate_csv(path: Path, env_steps: int) -> float:
+    """Drop the rows after ``env_steps``, and any row a crash left unfinished.
+
+    Args:
+        path: a ``metrics.csv``; the file is replaced whole.
+        env_steps: transitions at the checkpoint the run resumes from.
+
+    Returns:
+        ``wall_s`` of the last row kept, 0 without rows.
+
+    Raises:
+        ValueError: the file has other columns.
+    """
+    with path.open(newline="") as file:
+        text = file.read()
+    whole = text[: text.rfind("\n") + 1]  # a row without its line end was being written
+    rows = list(csv.reader(io.StringIO(whole, newline="")))
+    if rows and tuple(rows[0]) != COLUMNS:
+        raise ValueError(f"{path} has columns {rows[0]}, expected {list(COLUMNS)}")
+    kept = [row for row in rows[1:] if len(row) == len(COLUMNS) and int(row[6]) <= env_steps]
+    partial = path.with_name(path.name + ".partial")
+    with partial.open("w", newline="") as file:
+        csv.writer(file, lineterminator="\n").writerows([COLUMNS, *kept])
+    partial.replace(path)
+    return float(kept[-1][8]) if kept else 0.0
