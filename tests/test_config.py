@@ -5,36 +5,31 @@ from __future__ import annotations
 import dataclasses
 import json
 from collections.abc import Callable
+from pathlib import Path
 
 import pytest
-from twirl_mjx.config import (
-    SCRIPTED_SOURCES,
-    SOURCE_OF,
-    TASKS,
-    BipedOptions,
-    DroqConfig,
-    EnvConfig,
-    EvalConfig,
-    HurdlesOptions,
-    ImitateOptions,
-    ReplayConfig,
-    TrainConfig,
-)
-from twirl_mjx.config import SHIFTS as SHIFT_NAMES
 
-from twirl_mjx.sim.dynamics import SHIFTS
+from twirl_mjx import records
+from twirl_mjx.droq.config import DroqConfig
+from twirl_mjx.policies.resolve import SCRIPTED_SOURCES
+from twirl_mjx.replay.config import ReplayConfig
+from twirl_mjx.tasks.biped import BipedOptions
+from twirl_mjx.tasks.hurdles import HurdlesOptions
+from twirl_mjx.tasks.imitate import ImitateOptions
+from twirl_mjx.tasks.registry import TASKS
 from twirl_mjx.training import config_json
+from twirl_mjx.training.config import EvalConfig, TrainConfig
 from twirl_mjx.training.presets import PRESETS, make_config
 
 
-@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("task", TASKS.names())
 @pytest.mark.parametrize("preset", PRESETS)
 def test_every_preset_builds_and_gives_whole_updates(task: str, preset: str) -> None:
     config = make_config(task, preset)
     assert config.task == task
     assert config.updates_per_step == pytest.approx(config.droq.utd * config.num_envs)
     assert config.blocks_per_step * config.droq.updates_per_block == config.updates_per_step
-    sourced = task in SOURCE_OF or config.source in SCRIPTED_SOURCES
+    sourced = config.task_type.source or config.source in SCRIPTED_SOURCES
     assert config.variant == ("twirl" if sourced else "scratch")
     assert make_config(task, preset) == config
     hash(config)
@@ -51,10 +46,6 @@ def test_paper_preset_has_the_numbers_of_table_4() -> None:
     assert droq.utd * droq.batch_size == 5120.0
 
 
-def test_names_of_shifts_agree_with_the_physics() -> None:
-    assert tuple(SHIFTS) == SHIFT_NAMES
-
-
 @pytest.mark.parametrize(
     ("build", "message"),
     [
@@ -66,7 +57,7 @@ def test_names_of_shifts_agree_with_the_physics() -> None:
         (lambda: DroqConfig(tau=2.0), r"outside \[0.0, 1.0\] \(nearest: 1.0\)"),
         (lambda: DroqConfig(discount=float("nan")), "discount"),
         (lambda: DroqConfig(hidden_sizes=()), "hidden_sizes"),
-        (lambda: EnvConfig(num_envs=0), r"nearest: 1\)"),
+        (lambda: TrainConfig(num_envs=0), r"nearest: 1\)"),
         (lambda: TrainConfig(replay=ReplayConfig(capacity=8)), "capacity 8 is below"),
         (lambda: TrainConfig(seed=-1), r"seed = -1 is outside \[0, 4294967295\] \(nearest: 0\)"),
         (lambda: TrainConfig(seed=2**32), r"seed = 4294967296 .*nearest: 4294967295"),
@@ -78,17 +69,16 @@ def test_bad_values_are_refused_with_the_nearest_valid(build, message: str) -> N
 
 
 def test_updates_that_do_not_divide_are_refused_with_the_numbers() -> None:
-    with pytest.raises(ValueError, match=r"1\.25 x env\.num_envs 16 = 20 .*block 16 .*utd 1\)"):
+    with pytest.raises(ValueError, match=r"1\.25 x num_envs 16 = 20 .*block 16 .*utd 1\)"):
         TrainConfig(droq=DroqConfig(utd=1.25, updates_per_block=16))
     with pytest.raises(ValueError, match="whole number"):
         TrainConfig(num_envs=1, droq=DroqConfig(utd=0.5, updates_per_block=1))
 
 
 def test_the_nearest_utd_is_accepted() -> None:
-    env = EnvConfig(num_envs=48)
     with pytest.raises(ValueError, match=r"nearest: utd 0\.416667\)"):
-        TrainConfig(env=env, droq=DroqConfig(utd=0.4))
-    assert TrainConfig(env=env, droq=DroqConfig(utd=0.416667)).updates_per_step == 20
+        TrainConfig(num_envs=48, droq=DroqConfig(utd=0.4))
+    assert TrainConfig(num_envs=48, droq=DroqConfig(utd=0.416667)).updates_per_step == 20
 
 
 def test_variants_decide_phi() -> None:
@@ -129,14 +119,14 @@ def test_json_with_an_unknown_key_is_refused() -> None:
         ("", "seed", True, "seed = True is bool, expected int"),
         ("", "task", 5, "task = 5 is int, expected str"),
         ("", "variant", 5, "variant = 5 is int, expected one of 'scratch', 'twirl'"),
-        ("", "droq", 5, "droq = 5 is int, expected DroqConfig"),
+        ("", "droq", 5, "config.droq is 5, expected names and values"),
         ("droq", "num_critics", 2.5, r"droq.num_critics = 2.5 is float, expected int .*nearest: 2"),
         ("droq", "hidden_sizes", 256, r"256 is int, expected tuple\[int, ...\] .*\(256,\)"),
         ("droq", "hidden_sizes", [256, 0.5], r"hidden_sizes = \(256, 0.5\) is tuple, expected"),
         ("droq", "utd", "20", r"droq.utd = '20' is str, expected float \(nearest: 20.0\)"),
         ("droq", "fast", 1, "droq.fast = 1 is int, expected bool"),
         ("droq", "target_entropy", "low", r"target_entropy = 'low' is str, expected float \| None"),
-        ("env", "train_episode_length", 9.5, r"9.5 is float, expected int \| None .*nearest: 10"),
+        ("eval", "episode_length", 9.5, r"9.5 is float, expected int .*nearest: 10"),
         ("biped", "fixed_goal", [1.0, 0.0, 0.0], r"fixed_goal = .* expected tuple\[float, float\]"),
     ],
 )
@@ -196,4 +186,43 @@ def test_departures_ignore_fields_at_their_default() -> None:
     assert config_json.departures(TrainConfig()) == {}
     config = dataclasses.replace(TrainConfig(), seed=3, droq=DroqConfig(tau=0.01))
     assert config_json.departures(config) == {"seed": 3, "droq.tau": 0.01}
-    assert config_json.departures(config.droq) == {"tau": 0.01}
+    assert records.departures(config.droq) == {"tau": 0.01}
+
+
+def test_names_on_the_command_line_are_those_of_the_file_and_of_grids() -> None:
+    config = make_config("biped", "debug")
+    names = set(config_json.flatten(config))
+    assert {"task", "num_envs", "shift", "biped.distance_weight", "stand.height_of", "droq.utd",
+            "replay.phi", "eval.episode_length"} <= names  # fmt: skip
+    changed = config_json.settle(config, {"biped.distance_weight": 4.0, "num_envs": 8})
+    assert (changed.options.distance_weight, changed.num_envs) == (4.0, 8)
+    with pytest.raises(ValueError, match="nearest: 'biped.distance_weight'"):
+        config_json.settle(config, {"biped.distance_wait": 4.0})
+
+
+def test_evaluation_is_without_what_is_for_training_only() -> None:
+    config = make_config("stand", "cpu")
+    assert (config.options.risen_fraction, config.episode_length) == (0.9, 100)
+    worlds = config.evaluation
+    assert (worlds.options.risen_fraction, worlds.episode_length) == (0.0, 400)
+    assert worlds.options.height_of == "front_feet"
+    assert worlds.num_envs == config.eval.episodes
+
+
+OLD = Path(__file__).parent / "training" / "version_0_1"
+
+
+@pytest.mark.parametrize("path", sorted(OLD.glob("*.json")), ids=lambda path: path.stem)
+def test_configs_of_version_0_1_are_read(path: Path) -> None:
+    """Written by commit d06aa54; ``*-debug`` are plain presets, ``stand-goal`` has options."""
+    config = config_json.from_json(path.read_text())
+    task, _, kind = path.stem.partition("-")
+    if kind == "debug":
+        assert config_json.diff(make_config(task, "debug"), config) == []
+    else:
+        plain = make_config("stand", "cpu")
+        assert config_json.diff(plain, config) == [
+            "stand.goal_max_radius: 5.0 -> 4.0", "stand.risen_fraction: 0.9 -> 0.5",
+            "num_envs: 64 -> 32", "episode_length: 100 -> 80", "seed: 0 -> 3",
+            "droq.utd: 0.5 -> 0.25", "eval.episode_length: 400 -> 300",
+        ]  # fmt: skip

@@ -15,42 +15,32 @@ ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = "twirl_mjx"
 
 BASE = {
-    "types",
-    "checks",
-    "exits",
-    "files",
-    "array_files",
-    "config",
-    "presets",
-    "config_json",
-    "assets",
-}
-WORLD = BASE | {"sim", "motion"}
-ACTING = WORLD | {"tasks", "droq", "policies"}
+    "types", "checks", "exits", "files", "array_files", "plugins", "records", "assets",
+}  # fmt: skip
+WORLD = BASE | {"sim", "motion", "tasks", "worlds"}
+ACTING = WORLD | {"droq", "policies"}
 ALLOWED: dict[str, set[str]] = {
     "types": set(),
     "checks": set(),
     "exits": set(),
+    "assets": set(),
     "files": {"checks"},
     "array_files": {"files"},
     "faults": {"exits"},
-    "assets": set(),
     "plugins": {"checks"},
-    "droq": {"types", "checks"},
-    "config": {"types", "checks", "droq"},
-    "presets": {"checks", "config"},
-    "config_json": {"checks", "config", "presets"},
+    "records": {"checks"},
     "sim": BASE,
-    "motion": WORLD,
-    "tasks": WORLD,
-    "replay": {"types", "checks", "files", "array_files", "config"},
-    "droq": {"types", "checks", "config"},
+    "motion": BASE | {"sim"},
+    "tasks": BASE | {"sim", "motion"},
+    "worlds": WORLD,
+    "droq": {"types", "checks"},
+    "replay": {"types", "checks", "files", "array_files"},
     "policies": ACTING,
     "evaluation": ACTING,
     "training": ACTING | {"evaluation", "replay"},
     "deploy": ACTING | {"evaluation", "figures"},
     "figures": {"checks", "files"},
-    "sweep": BASE | {"training", "figures"},
+    "sweep": ACTING | {"training", "figures"},
     "bench": ACTING | {"evaluation", "replay", "training", "deploy", "figures"},
     "commands": ACTING
     | {"evaluation", "replay", "training", "deploy", "figures", "sweep", "bench"},
@@ -58,7 +48,7 @@ ALLOWED: dict[str, set[str]] = {
 """What each part may import of ours, besides itself; ``cli`` and the package root: everything."""
 
 EVERYTHING = {"__init__", "cli"}
-MAX_FILE_LINES = 350
+MAX_FILE_LINES = 500
 MAX_FUNCTION_LINES = 60
 LONGER_FUNCTIONS = {("twirl_mjx/training/loop.py", "train"): 80}
 """The Python loop of a run, which is the one sequence of steps that reads best in one piece."""

@@ -68,7 +68,7 @@ def parse_train(argv: list[str], prog: str = "twirl train") -> TrainOptions:
 
 
 def _shown(config: TrainConfig) -> TrainConfig:
-    """Return a config of a class that shows the options of its task and learner under their names."""
+    """Return a config of a class that shows options of task and learner under their names."""
     sections = [("options", config.task, config.options)]
     if config.task_type.source:
         sections.append(("source_options", config.task_type.source, config.source_options))
