@@ -35,7 +35,7 @@ ALLOWED: dict[str, set[str]] = {
     "training": ACTING | {"evaluation", "replay"},
     "deploy": ACTING | {"evaluation", "figures"},
     "figures": set(),
-    "sweep": BASE | {"training", "figures"},
+    "sweep": BASE | {"evaluation", "training", "figures"},
     "bench": ACTING | {"evaluation", "replay", "training", "deploy", "figures"},
     "commands": ACTING
     | {"evaluation", "replay", "training", "deploy", "figures", "sweep", "bench"},

@@ -156,3 +156,11 @@ def tracker_reset(task: str, tracker: Tracker, done: jax.Array) -> Tracker:
     """Empty the measures of the worlds in ``done`` [N]."""
     empty = tracker_init(task, done.shape[0])
     return jax.tree.map(lambda new, old: jnp.where(done, new, old), empty, tracker)
+
+
+LEADS: dict[str, tuple[str, ...]] = {"hurdles": ("hurdles_passed", "single_flight", "return")}
+"""What a task is judged by in figures and tables, the main measure first; its return otherwise."""
+RATIOS: dict[str, tuple[str, str]] = {"single_flight": ("clean_clearances", "hurdles_passed")}
+"""Measures that figures and tables compute: the first over the second, where that is not zero."""
+SMALLER_IS_BETTER = ("terminated", "min_distance", "hit_hurdle", "fall")
+"""Measures of which less is better."""

@@ -1,19 +1,20 @@
 """From rows to numbers: runs on a common axis, last values, and summaries per cell.
 
-A *cell* is what is compared: one variant (and phi, and utd) of one task under one shift; its
-samples are its seeds.
+A *cell* is what is compared: one variant (with its settings, such as phi) of one task under one
+shift; its samples are its runs, which differ by their seeds.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from twirl_mjx.figures.errors import TableError, nearest
+from twirl_mjx.figures.facts import DOES_NOTHING, EVALUATION, Axis, Facts
 from twirl_mjx.figures.statistics import Interval, bootstrap, bootstrap_band, iqm, mean, std
-from twirl_mjx.figures.style import SHIFTS, TASKS, VARIANTS, canonical, metric_info
-from twirl_mjx.figures.tables import Table, TableError, mask, nearest, select
+from twirl_mjx.figures.tables import LABEL_COLUMN, Table, mask, select, sort_key
 
 STATISTICS = ("mean", "iqm", "rate")
 """What centre and bounds mean: ``mean``: mean and standard deviation (paper style); ``iqm``:
@@ -23,7 +24,6 @@ MAX_POINTS = 200
 """Points kept of a drawn curve."""
 
 _BOOTSTRAPPED = {"iqm": iqm, "rate": mean}
-_ORDERS: Mapping[str, tuple[str, ...]] = {"task": TASKS, "shift": SHIFTS, "variant": VARIANTS}
 
 
 @dataclass(frozen=True)
@@ -54,10 +54,20 @@ class Curve:
     """Upper edge of the band, [T]; NaN for a single run."""
 
 
+def ordered(table: Table, column: str) -> list:
+    """Return the distinct values of a column in the order of figures.
+
+    First those the facts list, as listed there; then numbers by size, text by appearance.
+    """
+    present = dict.fromkeys(table[column].tolist())
+    known = [value for value in table.facts.order(column) if value in present]
+    rest = [value for value in present if value not in known]
+    numbers = not any(sort_key(value)[0] for value in rest)
+    return known + (sorted(rest, key=sort_key) if numbers else rest)
+
+
 def groups(table: Table, columns: Sequence[str]) -> dict[tuple, Table]:
     """Split a table by the values of columns, in the order of figures.
-
-    Rows whose value is NaN in a grouping column belong to no group.
 
     Args:
         table: Any table.
@@ -66,7 +76,7 @@ def groups(table: Table, columns: Sequence[str]) -> dict[tuple, Table]:
     Returns:
         Values of the columns -> rows; only combinations that occur.
     """
-    orders = {c: canonical(_without_nan(table[c]), _ORDERS.get(c, ())) for c in columns}
+    orders = {c: ordered(table, c) for c in columns}
     parts: dict[tuple, Table] = {(): table}
     for column in columns:
         finer = {}
@@ -77,6 +87,82 @@ def groups(table: Table, columns: Sequence[str]) -> dict[tuple, Table]:
                     finer[(*key, value)] = mask(part, rows)
         parts = finer
     return parts
+
+
+def is_idle(table: Table) -> np.ndarray:
+    """Return which rows are of a policy that learns nothing (``DOES_NOTHING``), [R] bool."""
+    return np.isin(table["variant"], DOES_NOTHING) | np.isin(table["run"], DOES_NOTHING)
+
+
+def labelled(table: Table) -> Table:
+    """Return the table with a column that names what a line, bar or row stands for.
+
+    The name holds the settings, and the variant where several have settings or there are none; of
+    a policy that learns nothing it is its name.
+    """
+    idle = is_idle(table)
+    columns = ["variant", *table.settings]
+    words = [table[column].tolist() for column in columns]
+    idlers = np.where(np.isin(table["run"], DOES_NOTHING), table["run"], table["variant"])
+    cells = [
+        (idlers[i], *[""] * (len(columns) - 1)) if idle[i] else cell
+        for i, cell in enumerate(zip(*words, strict=True))
+    ]
+    several = len({cell[0] for cell in cells if any(cell[1:])}) > 1
+    names = {cell: _cell_name(cell, columns, several=several) for cell in dict.fromkeys(cells)}
+    ranks = [{value: i for i, value in enumerate(ordered(table, c))} for c in columns]
+    inside = sorted(
+        names, key=lambda cell: [r.get(v, len(r)) for r, v in zip(ranks, cell, strict=True)]
+    )
+    axes = {**table.facts.axes, LABEL_COLUMN: Axis(order=tuple(names[cell] for cell in inside))}
+    labels = np.array([names[cell] for cell in cells], dtype=str)
+    return replace(
+        table,
+        columns={**table.columns, LABEL_COLUMN: labels},
+        facts=replace(table.facts, axes=axes),
+    )
+
+
+def _cell_name(cell: Sequence[str], columns: Sequence[str], *, several: bool) -> str:
+    pairs = zip(columns[1:], cell[1:], strict=True)
+    settings = [f"{column} = {value}" for column, value in pairs if value]
+    return ", ".join([cell[0], *settings] if several or not settings else settings)
+
+
+def lead_metrics(table: Table, task: str) -> list[str]:
+    """Return the measures a task is led by, as all of its learning runs report them.
+
+    Those of evaluations (``eval/``) go before those of the exploring policy.
+
+    Raises:
+        TableError: If no lead is reported by all runs; the message names a run without.
+    """
+    rows = mask(table, table["task"] == task)
+    learning = mask(rows, ~is_idle(rows))
+    rows = learning if len(learning) else rows
+    per_run = [set(part["metric"].tolist()) for part in groups(rows, ["arm", "run"]).values()]
+    shared = set.intersection(*per_run)
+    wanted = dict.fromkeys((*table.facts.lead(task), "return"))
+    for prefix in (EVALUATION, ""):
+        if found := [prefix + name for name in wanted if prefix + name in shared]:
+            return found
+    names = ", ".join(f"'{name}'" for name in wanted)
+    lacking = [key[1] for key in groups(rows, ["arm", "run"])]
+    lacking = [run for run, have in zip(lacking, per_run, strict=True) if not have & {*wanted}]
+    who = f"run '{lacking[0]}' has" if lacking else "its runs have"
+    raise TableError(f"{table.source}: {who} none of {names} for all runs to compare by")
+
+
+def shown_metrics(table: Table, task: str) -> list[str]:
+    """Return the leads of a task, then all measures of the same prefix that its rows hold."""
+    leads = lead_metrics(table, task)
+    prefix = EVALUATION if leads[0].startswith(EVALUATION) else ""
+    rows = mask(table, (table["task"] == task) & ~np.isnan(table["value"]))
+    present = dict.fromkeys(rows["metric"].tolist())
+    listed = [prefix + name for name in table.facts.measures]
+    names = dict.fromkeys((*leads, *(n for n in listed if n in present), *present))
+    same = (n for n in names if n.startswith(EVALUATION) == bool(prefix))
+    return list(same)
 
 
 def metric_rows(table: Table, metric: str) -> Table:
@@ -170,7 +256,8 @@ def seed_counts(table: Table, by: str) -> tuple[int, str]:
         table: Any rows.
         by: What a cell stands for, besides task and shift.
     """
-    cells = groups(table, ["task", "shift", by]).values()
+    learning = mask(table, ~is_idle(table))
+    cells = groups(learning if len(learning) else table, ["task", "shift", by]).values()
     counts = [len(groups(cell, ["arm", "run", "seed"])) for cell in cells]
     low, high = min(counts), max(counts)
     return high, f"{low} to {high} seeds" if low < high else f"{high} seed{'s' * (high > 1)}"
@@ -179,11 +266,14 @@ def seed_counts(table: Table, by: str) -> tuple[int, str]:
 def common_end(table: Table) -> dict[tuple, int]:
     """Return, per (task, shift), the transitions that every trained run reached.
 
-    Runs without training (the source, zero-shot) do not count. This is the moment at which
+    Runs without training (zero-shot, or a policy that learns nothing) do not count. This is the moment at which
     variants are compared: never one run's longer training against another's shorter one.
     """
     ends = {}
+    learning = mask(table, ~is_idle(table))
     for key, part in groups(table, ["task", "shift"]).items():
+        ends[key] = 0
+    for key, part in groups(learning, ["task", "shift"]).items():
         lasts = [s["env_steps"].max() for s in groups(part, ["arm", "run", "seed"]).values()]
         ends[key] = int(min((last for last in lasts if last > 0), default=0))
     return ends
@@ -204,42 +294,43 @@ def final_values(series: Sequence[Series], env_steps: int) -> np.ndarray:
     return np.array([step_hold(s, np.array([env_steps]))[0] for s in series])
 
 
-def estimate(strata: Sequence[np.ndarray], statistic: str) -> Interval:
+def estimate(runs: Sequence[np.ndarray], statistic: str) -> Interval:
     """Return centre and bounds of samples by a named statistic.
 
     Args:
-        strata: Samples [n_k] per stratum.
+        runs: Samples [E_k] of every run.
         statistic: One of ``STATISTICS``.
     """
     if check_statistic(statistic) != "mean":
-        return bootstrap(strata, _BOOTSTRAPPED[statistic])
-    pooled = np.concatenate(strata)
+        return bootstrap(runs, _BOOTSTRAPPED[statistic])
+    pooled = np.concatenate(runs)
     centre, spread = float(mean(pooled)), float(std(pooled))
     return Interval(centre, centre - spread, centre + spread)
 
 
-def cell_strata(table: Table, env_steps: int) -> list[np.ndarray]:
-    """Return the samples of one cell from the rows of one metric.
+def cell_runs(table: Table, env_steps: int) -> list[np.ndarray]:
+    """Return the samples of one cell, one array per run, from the rows of one metric.
 
     Args:
         table: Rows of one metric in one cell.
-        env_steps: Moment of comparison; not used for episodes.
+        env_steps: Moment of comparison; not used for episodes, nor where nothing was trained.
 
     Returns:
-        Episodes: one stratum [E] per run, of its longest trained policy. Curves: one stratum
-        [S] with a value per run.
+        Episodes: those [E] of the run's longest trained policy. Curves: its value [1].
 
     Raises:
         TableError: If an episode appears twice or a run has no value by ``env_steps``.
     """
     if table.is_episodes:
         return [_last_episodes(part) for part in groups(table, ["seed", "run"]).values()]
-    return [final_values(run_series(table), env_steps)]
+    if is_idle(table).all():
+        env_steps = int(table["env_steps"].max())
+    return [np.array([value]) for value in final_values(run_series(table), env_steps)]
 
 
-def statistics_of(metric: str) -> tuple[str, ...]:
+def statistics_of(facts: Facts, metric: str) -> tuple[str, ...]:
     """Return the statistics in which a metric is shown."""
-    return ("rate",) if metric_info(metric).is_rate else ("mean", "iqm")
+    return ("rate",) if facts.measure(metric).is_rate else ("mean", "iqm")
 
 
 def check_statistic(statistic: str) -> str:
@@ -251,10 +342,6 @@ def check_statistic(statistic: str) -> str:
     if statistic not in STATISTICS:
         raise ValueError(f"no statistic '{statistic}'{nearest(statistic, STATISTICS)}")
     return statistic
-
-
-def _without_nan(values: np.ndarray) -> list:
-    return (values[~np.isnan(values)] if values.dtype.kind == "f" else values).tolist()
 
 
 def _last_episodes(table: Table) -> np.ndarray:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from html import escape
 from pathlib import Path
 
-from twirl_mjx.figures.tables import nearest
+from twirl_mjx.figures.errors import nearest
 
 _VIDEO = {".mp4": "video/mp4", ".webm": "video/webm"}
 _IMAGE = {".png": "image/png", ".jpg": "image/jpeg", ".jpeg": "image/jpeg", ".gif": "image/gif"}
@@ -205,6 +205,7 @@ th:first-child, td:first-child { padding-left: 0; }
 .number { text-align: right; }
 .best { font-weight: 700; }
 .bounds { display: block; color: var(--quiet); font-size: 0.92em; font-weight: 400; }
+.idle { color: var(--quiet); font-weight: 400; }
 .commands { white-space: normal; min-width: 170px; }
 code { font: 0.92em ui-monospace, "DejaVu Sans Mono", Menlo, Consolas, monospace;
   background: var(--code); padding: 1px 5px; border-radius: 4px; }
