@@ -158,7 +158,11 @@ def tracker_reset(task: str, tracker: Tracker, done: jax.Array) -> Tracker:
     return jax.tree.map(lambda new, old: jnp.where(done, new, old), empty, tracker)
 
 
-LEADS: dict[str, tuple[str, ...]] = {"hurdles": ("hurdles_passed", "single_flight", "return")}
+LEADS: dict[str, tuple[str, ...]] = {
+    "stand": ("return", "standing_time"),
+    "biped": ("return", "standing_time", "success"),
+    "hurdles": ("hurdles_passed", "single_flight", "return"),
+}
 """What a task is judged by in figures and tables, the main measure first; its return otherwise."""
 RATIOS: dict[str, tuple[str, str]] = {"single_flight": ("clean_clearances", "hurdles_passed")}
 """Measures that figures and tables compute: the first over the second, where that is not zero."""

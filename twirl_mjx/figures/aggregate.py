@@ -62,7 +62,7 @@ def ordered(table: Table, column: str) -> list:
     present = dict.fromkeys(table[column].tolist())
     known = [value for value in table.facts.order(column) if value in present]
     rest = [value for value in present if value not in known]
-    numbers = not any(sort_key(value)[0] for value in rest)
+    numbers = not any(sort_key(value)[0] for value in rest if value != "")
     return known + (sorted(rest, key=sort_key) if numbers else rest)
 
 

@@ -113,8 +113,8 @@ def shift_bars(
                     continue
                 slot = Slot(group, bars.index(value), len(bars))
                 _draw_bar(axes, slot, runs, statistic, marks[value], frame.theme)
-            axes.set_title(task)
             frame.ylabel(axes, rows.facts.label(metric))
+            frame.title(axes, task)
             frame.xticks(axes, shifts)
             axes.tick_params(axis="x", length=0)
         frame.captions.append(_bars_caption(rows, statistic, by, ends))
@@ -162,8 +162,8 @@ def ablation(
             task, shift, *values = key
             pairs = zip(others, values, strict=True)
             words = [v if c == "variant" else f"{c} = {v}" for c, v in pairs]
-            frame.title(left, place_name(task, shift, *words))
             frame.ylabel(left, rows.facts.label(metric))
+            frame.title(left, place_name(task, shift, *words))
             levels = (rows["task"] == task) & (rows["shift"] == shift) & _untrained(rows, column)
             _draw_effect(frame, left, part, mask(rows, levels), column, marks, statistic)
             steps_axis(left)

@@ -45,8 +45,7 @@ class Canvas:
 
     def title(self, axes: Axes, text: str) -> None:
         """Set the title of a panel, in as many lines as its width needs."""
-        room = self.figure.get_figwidth() / self.axes.shape[1] - 0.5
-        axes.set_title("\n".join(wrapped(text, room, _PANEL_SIZE, "bold")))
+        axes.set_title("\n".join(wrapped(text, self._panel_width(axes), _PANEL_SIZE, "bold")))
 
     def ylabel(self, axes: Axes, text: str) -> None:
         """Set the label of a vertical axis, in as many lines as its height needs."""
@@ -55,10 +54,15 @@ class Canvas:
 
     def xticks(self, axes: Axes, names: list[str]) -> None:
         """Name places 0, 1, ... of a horizontal axis, in as many lines as their room needs."""
-        room = (self.figure.get_figwidth() / self.axes.shape[1] - 0.7) / max(len(names), 1) - 0.05
+        room = self._panel_width(axes) / max(len(names), 1) - 0.1
         lines = ["\n".join(wrapped(name, room, _LABEL_SIZE)) for name in names]
         axes.set_xticks(range(len(names)), lines)
         axes.set_xlim(-0.5, len(names) - 0.5)
+
+    def _panel_width(self, axes: Axes) -> float:
+        """Return the width of a panel whose vertical label is set, inches."""
+        lines = axes.get_ylabel().count("\n")
+        return self.figure.get_figwidth() / self.axes.shape[1] - 0.65 - 0.15 * lines
 
 
 @contextmanager

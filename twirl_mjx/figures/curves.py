@@ -68,12 +68,12 @@ def learning_curves(
             row, column = places[(task, shift)]
             axes = frame.axes[row, column]
             axes.set_visible(True)
+            if column == 0:
+                frame.ylabel(axes, rows.facts.label(metric))
             frame.title(axes, place_name(task, shift))
             draw_curves(frame, axes, part, marks, statistic=statistic)
             below = [places[k] for k in places if places[k][1] == column]
             steps_axis(axes, ticks=5 if shape[1] < 3 else 3, label=row == max(r for r, _ in below))
-            if column == 0:
-                frame.ylabel(axes, rows.facts.label(metric))
         frame.captions.append(curves_caption(rows, statistic))
     return frame.figure
 
