@@ -43,7 +43,7 @@ REDUCED_NOTE = (
 
 RESULTS = {
     "title": "Adapting to changed dynamics",
-    "about": "Adapting a finished policy to a dynamics shift; weights: its networks without its data.",
+    "about": "Adapting a finished policy to a shift; weights: its networks without its data.",
     "place": 20,
     "baseline": {"variant": "weights"},
 }

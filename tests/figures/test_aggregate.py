@@ -3,7 +3,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from twirl_mjx.figures import aggregate, tables
+from twirl_mjx.figures import aggregate, cells, tables
 from twirl_mjx.figures.aggregate import Series
 from twirl_mjx.figures.errors import TableError
 from twirl_mjx.figures.facts import Axis, Facts, Measure
@@ -50,36 +50,36 @@ def test_curves_by_hand():
 def test_groups_follow_the_order_of_figures(table_of):
     names = ["source", "weights", "other", "twirl"]
     table = table_of([row(n, 0, 0, 1.0, variant=n) for n in names])
-    assert [key[0] for key in aggregate.groups(table, ["variant"])] == names
+    assert [key[0] for key in cells.groups(table, ["variant"])] == names
     listed = dataclasses.replace(
         table, facts=Facts(axes={"variant": Axis(order=("twirl", "absent", "source"))})
     )
-    order = [key[0] for key in aggregate.groups(listed, ["variant"])]
+    order = [key[0] for key in cells.groups(listed, ["variant"])]
     assert order == ["twirl", "source", "weights", "other"]
 
 
 def test_a_label_holds_what_tells_arms_apart(tmp_path, write):
     columns = [*tables.CURVE_COLUMNS, "tau", "size"]
-    cells = [("10", "small"), ("9", "small"), ("9", "big")]
-    rows = [[*row(f"r{i}", 0, 5, 1.0), *cell] for i, cell in enumerate(cells)]
+    pairs = [("10", "small"), ("9", "small"), ("9", "big")]
+    rows = [[*row(f"r{i}", 0, 5, 1.0), *cell] for i, cell in enumerate(pairs)]
     rows += [[*row("z", 0, 0, 1.0, variant="zero-shot"), "", ""]]
     rows += [[*row("zero", 0, 7, 1.0, variant="scripted"), "", ""]]
     table = tables.read_table(write(tmp_path / "a.csv", columns, rows))
     assert table.settings == ["tau", "size"]
-    labelled = aggregate.labelled(table)
-    assert aggregate.ordered(labelled, "label") == [
+    labelled = cells.labelled(table)
+    assert cells.ordered(labelled, "label") == [
         "tau = 9, size = small",
         "tau = 9, size = big",
         "tau = 10, size = small",
         "zero-shot",
         "zero",
     ]
-    assert aggregate.is_idle(table).tolist() == [False] * 4 + [True]
+    assert cells.is_idle(table).tolist() == [False] * 4 + [True]
     assert labelled.settings == ["tau", "size"]
     # With two variants of which one has settings, the variant is said too.
     more = [*rows, [*row("w", 0, 5, 1.0, variant="weights"), "9", "big"]]
-    table = aggregate.labelled(tables.read_table(write(tmp_path / "b.csv", columns, more)))
-    names = aggregate.ordered(table, "label")
+    table = cells.labelled(tables.read_table(write(tmp_path / "b.csv", columns, more)))
+    names = cells.ordered(table, "label")
     assert {"weights, tau = 9, size = big", "twirl, tau = 9, size = big"} <= set(names)
 
 
@@ -152,11 +152,11 @@ def test_what_leads_a_task_is_what_all_learning_runs_report(table_of):
         return [run, "biped", "icy", variant, 0, name, 5, 0, 0.0, 1.0]
 
     both = table_of([named("eval/return"), named("return"), named("eval/q"), named("q")])
-    assert aggregate.lead_metrics(both, "biped") == ["eval/return"]
-    assert aggregate.shown_metrics(both, "biped") == ["eval/return", "eval/q"]
+    assert cells.lead_metrics(both, "biped") == ["eval/return"]
+    assert cells.shown_metrics(both, "biped") == ["eval/return", "eval/q"]
     mixed = table_of([named("eval/return"), named("return"), named("q"), named("return", "b")])
-    assert aggregate.shown_metrics(mixed, "biped") == ["return", "q"]
+    assert cells.shown_metrics(mixed, "biped") == ["return", "q"]
     idle = table_of([named("eval/return"), named("return", "zero", "scripted")])
-    assert aggregate.lead_metrics(idle, "biped") == ["eval/return"]
+    assert cells.lead_metrics(idle, "biped") == ["eval/return"]
     with pytest.raises(TableError, match="run 'b' has none of 'return' for all runs"):
-        aggregate.lead_metrics(table_of([named("return"), named("q", "b")]), "biped")
+        cells.lead_metrics(table_of([named("return"), named("q", "b")]), "biped")

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from twirl_mjx.figures import page, report, tables
+from twirl_mjx.figures import page, report, tables, wording
+from twirl_mjx.figures.errors import TableError
 from twirl_mjx.figures.page import Media, MediaError
 from twirl_mjx.figures.statistics import Interval
-from twirl_mjx.figures.errors import TableError
 
 ADDRESSES = ("src", "srcset", "href", "data", "poster", "action", "background")
 VOID = ("meta", "link", "img", "source", "br", "input", "hr")
@@ -172,11 +172,11 @@ def test_unusable_clips_are_refused(tmp_path):
 
 
 def test_numbers_are_written_alike():
-    assert report.interval_text(Interval(1446.4, 1317.6, 1594.0)) == "1,446 [1,318, 1,594]"
-    assert report.interval_text(Interval(0.5, 0.25, 0.75)) == "0.50 [0.25, 0.75]"
-    assert report.interval_text(Interval(12.34, float("nan"), float("nan"))) == "12.3"
-    assert report.numbers(float("nan")) == ["\N{EN DASH}"]
-    assert [report.duration(s) for s in (42.0, 1020.0, 7500.0)] == ["42 s", "17 min", "2 h 05 min"]
+    assert wording.interval_text(Interval(1446.4, 1317.6, 1594.0)) == "1,446 [1,318, 1,594]"
+    assert wording.interval_text(Interval(0.5, 0.25, 0.75)) == "0.50 [0.25, 0.75]"
+    assert wording.interval_text(Interval(12.34, float("nan"), float("nan"))) == "12.3"
+    assert wording.numbers(float("nan")) == ["\N{EN DASH}"]
+    assert [wording.duration(s) for s in (42.0, 1020.0, 7500.0)] == ["42 s", "17 min", "2 h 05 min"]
 
 
 def test_the_main_result_opens_the_page_and_smoke_stays_out(tmp_path, write, rows_of, facts_of):

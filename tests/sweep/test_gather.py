@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from twirl_mjx.figures.aggregate import lead_metrics
+from twirl_mjx.figures.cells import lead_metrics
 from twirl_mjx.figures.plots import make_figures, read_grids
 from twirl_mjx.figures.report import write_report
 from twirl_mjx.figures.summary import summarise

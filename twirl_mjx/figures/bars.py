@@ -17,14 +17,11 @@ from twirl_mjx.figures.aggregate import (
     check_statistic,
     common_end,
     estimate,
-    groups,
-    is_idle,
-    labelled,
     metric_rows,
-    ordered,
     seed_counts,
 )
 from twirl_mjx.figures.canvas import Canvas, canvas, steps_axis
+from twirl_mjx.figures.cells import groups, is_idle, labelled, ordered
 from twirl_mjx.figures.curves import (
     MEANINGS,
     curves_caption,

@@ -14,15 +14,12 @@ from twirl_mjx.figures.aggregate import (
     check_statistic,
     curve,
     estimate,
-    groups,
-    is_idle,
-    labelled,
     metric_rows,
-    ordered,
     run_series,
     seed_counts,
 )
 from twirl_mjx.figures.canvas import Canvas, canvas, steps_axis
+from twirl_mjx.figures.cells import groups, is_idle, labelled, ordered
 from twirl_mjx.figures.style import Mark, Theme, category_mark, ordered_mark
 from twirl_mjx.figures.tables import LABEL_COLUMN, Table, mask
 

@@ -124,6 +124,14 @@ class Facts:
         return self.tasks.get(task, TaskFacts()).lead
 
 
+def sort_key(label: object) -> tuple[bool, float, str]:
+    """Return what sorts labels: numbers by size, then other text."""
+    try:
+        return False, float(str(label)), ""
+    except ValueError:
+        return True, 0.0, str(label)
+
+
 def read_facts(folder: Path) -> Facts:
     """Read ``grid.json`` of a folder of tables; defaults where there is none.
 

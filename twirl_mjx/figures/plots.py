@@ -8,9 +8,10 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 
-from twirl_mjx.figures.aggregate import lead_metrics, ordered, shown_metrics, statistics_of
+from twirl_mjx.figures.aggregate import statistics_of
 from twirl_mjx.figures.bars import ablation, shift_bars
 from twirl_mjx.figures.canvas import write_png
+from twirl_mjx.figures.cells import lead_metrics, ordered, shown_metrics
 from twirl_mjx.figures.curves import learning_curves
 from twirl_mjx.figures.errors import TableError
 from twirl_mjx.figures.facts import read_facts

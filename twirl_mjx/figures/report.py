@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from twirl_mjx.figures import page
-from twirl_mjx.figures.aggregate import groups, is_idle, lead_metrics, ordered, shown_metrics
 from twirl_mjx.figures.canvas import png_bytes, reduced_caption
+from twirl_mjx.figures.cells import groups, is_idle, lead_metrics, ordered, shown_metrics
 from twirl_mjx.figures.curves import place_name
 from twirl_mjx.figures.errors import TableError
 from twirl_mjx.figures.facts import Facts, Measure
@@ -22,32 +22,11 @@ from twirl_mjx.figures.statistics import FEW_RUNS, Interval
 from twirl_mjx.figures.style import short_count
 from twirl_mjx.figures.summary import Summary, best, summarise
 from twirl_mjx.figures.tables import Table, mask
+from twirl_mjx.figures.wording import TERMS, duration, interval_text, numbers
 
 __all__ = ["Media", "write_report"]
 
 _SHORT_TABLE = 12  # rows; a longer table of details is folded
-
-_TERMS = """<dl>
-<dt>mean [95 %], IQM [95 %]</dt><dd>Mean and interquartile mean (without the lowest and highest
-quarter; the plain mean below four samples, and for shares) over all runs and episodes. In brackets
-a percentile bootstrap interval, 2000 resamples, fixed seed, that draws runs first, then episodes
-within each.</dd>
-<dt>interval over</dt><dd>What was drawn anew. <em>episodes (1 run)</em>: the interval is about this
-one policy and says nothing about training again with another seed. With two to four runs the
-bounds over runs are close to their range, which is narrower than the truth: read the single runs
-beside it. A single value has no interval.</dd>
-<dt>each run</dt><dd>The mean of every run, in the order of the seeds.</dd>
-<dt>ratio</dt><dd>IQM (mean for shares) over that of the baseline of the same task and shift, both
-sides drawn anew. Compare ratios with the paper, not returns: its text does not fix their
-scale.</dd>
-<dt>P(better)</dt><dd>Probability that a random sample of this row is better than a random one of
-the baseline, ties counted half; both sides drawn anew.</dd>
-<dt>learns nothing</dt><dd>A policy that is not trained in the task, such as one that does nothing:
-a level to beat, and never the best of its row.</dd>
-<dt>transitions</dt><dd>Control steps summed over all worlds. Arms are compared at the
-transitions that every trained run of the same task and shift has reached.</dd>
-<dt>updates, wall time</dt><dd>Critic updates and time by then, of the run with the most.</dd>
-</dl>"""
 
 
 @dataclass(frozen=True)
@@ -110,7 +89,7 @@ def write_report(
     if clips:
         shown = "".join(page.clip(m) for m in clips)
         sections.insert(1, ("clips", "Clips", f'<div class="clips">{shown}</div>'))
-    sections.append(("terms", "How to read the numbers", _TERMS))
+    sections.append(("terms", "How to read the numbers", TERMS))
     links = "".join(f'<li><a href="#{escape(k)}">{escape(t)}</a></li>' for k, t, _ in sections)
     body = "".join(
         f'<section id="{escape(key)}" aria-labelledby="{escape(key)}-title">'
@@ -322,29 +301,6 @@ def _commands(grid: str, summary: Summary) -> tuple[str, ...]:
 
 def _place(summary: Summary) -> str:
     return place_name(summary.task, summary.shift)
-
-
-def interval_text(interval: Interval) -> str:
-    """Write an interval as "2.9 [2.5, 3.4]", or without brackets where there are no bounds."""
-    centre, low, high = numbers(interval.estimate, interval.low, interval.high)
-    return centre if np.isnan(interval.low) else f"{centre} [{low}, {high}]"
-
-
-def numbers(*values: float) -> list[str]:
-    """Write numbers with the digits that suit the largest; NaN is a dash."""
-    size = max((abs(value) for value in values if not np.isnan(value)), default=0.0)
-    digits = 0 if size >= 100 else 1 if size >= 10 else 2
-    return ["\N{EN DASH}" if np.isnan(value) else f"{value:,.{digits}f}" for value in values]
-
-
-def duration(seconds: float) -> str:
-    """Write a duration as "2 h 05 min", "17 min" or "42 s"; NaN is a dash."""
-    if np.isnan(seconds):
-        return "\N{EN DASH}"
-    if seconds < 60:
-        return f"{seconds:.0f} s"
-    minutes = round(seconds / 60)
-    return f"{minutes // 60} h {minutes % 60:02d} min" if minutes >= 60 else f"{minutes} min"
 
 
 def _interval_html(interval: Interval, *, best: bool = False) -> str:

@@ -7,16 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from twirl_mjx.figures.aggregate import (
-    cell_runs,
-    common_end,
-    estimate,
-    groups,
-    is_idle,
-    labelled,
-    metric_rows,
-    statistics_of,
-)
+from twirl_mjx.figures.aggregate import cell_runs, common_end, estimate, metric_rows, statistics_of
+from twirl_mjx.figures.cells import groups, is_idle, labelled
 from twirl_mjx.figures.facts import Measure
 from twirl_mjx.figures.statistics import (
     Interval,

@@ -23,7 +23,7 @@ from pathlib import Path
 import numpy as np
 
 from twirl_mjx.figures.errors import TableError, nearest
-from twirl_mjx.figures.facts import EVALUATION, Facts, read_facts
+from twirl_mjx.figures.facts import EVALUATION, Facts, read_facts, sort_key
 
 CURVE_COLUMNS = (
     "run",
@@ -248,14 +248,6 @@ def select(table: Table, **equals: object) -> Table:
 def unique(table: Table, column: str) -> list:
     """Return the distinct values of a column, sorted; numbers in text by their size."""
     return sorted(set(table[column].tolist()), key=sort_key)
-
-
-def sort_key(label: object) -> tuple[bool, float, str]:
-    """Return what sorts labels: numbers by size, then other text."""
-    try:
-        return False, float(str(label)), ""
-    except ValueError:
-        return True, 0.0, str(label)
 
 
 def note_texts(table: Table, key: str) -> list[str]:

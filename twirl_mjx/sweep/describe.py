@@ -128,4 +128,4 @@ def write(path: Path, text: str) -> None:
 
 if __name__ == "__main__":
     for argument in sys.argv[1:]:
-        print(f"wrote {describe(Path(argument))}")  # noqa: T201
+        print(f"wrote {describe(Path(argument))}")

@@ -1,10 +1,10 @@
 """From finished runs to the committed tables: ``experiments/results/<grid>/<arm>.csv``.
 
 Per arm a curve table (what is measured of episodes, at most ``MAX_POINTS`` rows each) and an
-episode table, with comment lines that say what was reduced and which command makes the rows again. An axis
-of the grid that tells apart arms which task, shift and variant do not is a column of both, such as
-``phi``. ``grid.json`` beside them says what the figures need to know of the grid. Tables of a smoke
-grid are no results: they stay in ``runs/smoke/``.
+episode table, with comment lines that say what was reduced and which command makes the rows again.
+An axis of the grid that tells apart arms which task, shift and variant do not is a column of both,
+such as ``phi``. ``grid.json`` beside them says what the figures need to know of the grid. Tables of
+a smoke grid are no results: they stay in ``runs/smoke/``.
 """
 
 from __future__ import annotations
