@@ -42,3 +42,11 @@ REDUCED_NOTE = (
     "nominal run, 99k of 100k transitions, UTD 0.5 of 20, target entropy -12 of -6, networks "
     "2 x 128 of 2 x 256, 3 seeds that share one nominal run"
 )
+
+RESULTS = {
+    "title": "How much source data (phi)",
+    "about": "Adapting with a share phi of source rows in every minibatch.",
+    "place": 30,
+    "titles": {"phi": "share of source rows in a minibatch"},
+    "baseline": {"phi": "0"},
+}

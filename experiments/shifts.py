@@ -40,3 +40,10 @@ REDUCED_NOTE = (
     "99k of 100k transitions, UTD 0.5 of 20, target entropy -12 of -6, networks 2 x 128 of 2 x 256,"
     " 1 of 3 seeds, without plain twirl"
 )
+
+RESULTS = {
+    "title": "Adapting to changed dynamics",
+    "about": "Adapting a finished policy to a shift; weights: its networks without its data.",
+    "place": 20,
+    "baseline": {"variant": "weights"},
+}

@@ -44,3 +44,11 @@ REDUCED_NOTE = (
     "transitions, target entropy -12 of -6, networks 2 x 128 of 2 x 256, 2 of 3 seeds that share "
     "one nominal run"
 )
+
+RESULTS = {
+    "title": "How many updates per transition (UTD)",
+    "about": "Adapting with more or fewer critic updates per transition.",
+    "place": 40,
+    "titles": {"utd": "critic updates per transition"},
+    "baseline": {"utd": "1"},
+}

@@ -1,6 +1,7 @@
 """Synthetic result tables. They are written below ``tmp_path`` only, never next to real results."""
 
 import csv
+import json
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
@@ -64,6 +65,26 @@ def episode_rows(task, shift, variant, seed, *, episodes=12):
         yield [*row, "success", float(rng.random() < level)]
 
 
+BASE = {"variant": "scratch"}
+FACTS = {
+    "axes": {
+        "task": {"order": ["biped", "hurdles"]},
+        "variant": {"order": [*LEVEL]},
+        "shift": {"order": ["none", *SHIFTS]},
+    },
+    "measures": {
+        "success": {"unit": "share"},
+        "standing_time": {"unit": "s"},
+        "min_distance": {"unit": "m", "smaller_is_better": True},
+    },
+}
+
+
+def write_facts(folder: Path, **more) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "grid.json").write_text(json.dumps(FACTS | more))
+
+
 def fill_results(
     root: Path, *, tasks=("biped", "hurdles"), shifts=SHIFTS, seeds=(0, 1, 2), points=21
 ) -> Path:
@@ -93,6 +114,9 @@ def fill_results(
             options = {"level": level, "extra": (value,), "points": points}
             cells = [(tasks[0], "icy", "twirl")]
             arm(grid, f"{tasks[0]}-{value}", cells, [*CURVES, grid], **options)
+    baselines = {"tasks": {"variant": "scratch"}, "shifts": {"variant": "weights"}}
+    for place, grid in enumerate(("tasks", "shifts", "phi", "utd", "evaluation")):
+        write_facts(root / grid, place=place, baseline=baselines.get(grid, {}))
     return root
 
 
@@ -100,6 +124,12 @@ def fill_results(
 def write() -> Callable[..., Path]:
     """The writer: (path, columns, rows, notes)."""
     return write_csv
+
+
+@pytest.fixture
+def facts_of() -> Callable:
+    """The writer of ``grid.json``: (folder, **keys)."""
+    return write_facts
 
 
 @pytest.fixture
@@ -128,6 +158,8 @@ def report_file(results, tmp_path_factory) -> Path:
         lines = [line for line in source.read_text().splitlines() if "standing_time" not in line]
         (root / "results" / "tasks").mkdir(parents=True, exist_ok=True)
         (root / "results" / "tasks" / source.name).write_text("\n".join(lines) + "\n")
+    for grid in ("tasks", "evaluation"):
+        write_facts(root / "results" / grid, place=int(grid == "evaluation"), baseline=BASE)
     for name in ("twirl", "zero-shot"):
         rows = episode_rows("biped", "icy", name, 0)
         write_csv(root / "results" / "evaluation" / f"biped-{name}.csv", EPISODES, rows)

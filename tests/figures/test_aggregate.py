@@ -1,9 +1,12 @@
+import dataclasses
+
 import numpy as np
 import pytest
 
-from twirl_mjx.figures import aggregate, tables
+from twirl_mjx.figures import aggregate, cells, tables
 from twirl_mjx.figures.aggregate import Series
-from twirl_mjx.figures.tables import TableError
+from twirl_mjx.figures.errors import TableError
+from twirl_mjx.figures.facts import Axis, Facts, Measure
 
 
 def row(run, seed, env_steps, value, *, task="biped", shift="icy", variant="twirl"):
@@ -47,8 +50,37 @@ def test_curves_by_hand():
 def test_groups_follow_the_order_of_figures(table_of):
     names = ["source", "weights", "other", "twirl"]
     table = table_of([row(n, 0, 0, 1.0, variant=n) for n in names])
-    order = [key[0] for key in aggregate.groups(table, ["variant"])]
-    assert order == ["twirl", "weights", "source", "other"]
+    assert [key[0] for key in cells.groups(table, ["variant"])] == names
+    listed = dataclasses.replace(
+        table, facts=Facts(axes={"variant": Axis(order=("twirl", "absent", "source"))})
+    )
+    order = [key[0] for key in cells.groups(listed, ["variant"])]
+    assert order == ["twirl", "source", "weights", "other"]
+
+
+def test_a_label_holds_what_tells_arms_apart(tmp_path, write):
+    columns = [*tables.CURVE_COLUMNS, "tau", "size"]
+    pairs = [("10", "small"), ("9", "small"), ("9", "big")]
+    rows = [[*row(f"r{i}", 0, 5, 1.0), *cell] for i, cell in enumerate(pairs)]
+    rows += [[*row("z", 0, 0, 1.0, variant="zero-shot"), "", ""]]
+    rows += [[*row("zero", 0, 7, 1.0, variant="scripted"), "", ""]]
+    table = tables.read_table(write(tmp_path / "a.csv", columns, rows))
+    assert table.settings == ["tau", "size"]
+    labelled = cells.labelled(table)
+    assert cells.ordered(labelled, "label") == [
+        "tau = 9, size = small",
+        "tau = 9, size = big",
+        "tau = 10, size = small",
+        "zero-shot",
+        "zero",
+    ]
+    assert cells.is_idle(table).tolist() == [False] * 4 + [True]
+    assert labelled.settings == ["tau", "size"]
+    # With two variants of which one has settings, the variant is said too.
+    more = [*rows, [*row("w", 0, 5, 1.0, variant="weights"), "9", "big"]]
+    table = cells.labelled(tables.read_table(write(tmp_path / "b.csv", columns, more)))
+    names = cells.ordered(table, "label")
+    assert {"weights, tau = 9, size = big", "twirl, tau = 9, size = big"} <= set(names)
 
 
 def test_runs_are_sorted_and_repeated_rows_dropped(table_of):
@@ -72,7 +104,8 @@ def test_values_are_compared_where_every_trained_run_has_been(table_of):
         [
             *(row("long", 0, s, s / 10) for s in (0, 100, 200)),
             *(row("short", 1, s, -s / 10) for s in (0, 100)),
-            row("zero", 0, 0, 7.0, variant="zero-shot"),
+            row("untrained", 0, 0, 7.0, variant="zero-shot"),
+            row("source", 0, 50, 7.0, variant="scripted"),
         ]
     )
     assert aggregate.common_end(table) == {("biped", "icy"): 100}
@@ -90,24 +123,40 @@ def test_unmeasured_rows_are_left_out(table_of):
         aggregate.metric_rows(table_of([row("a", 0, 10, "nan")]), "return")
 
 
-def test_episodes_are_strata_per_run_of_the_longest_trained_policy(tmp_path, write):
+def test_episodes_are_those_per_run_of_the_longest_trained_policy(tmp_path, write):
     def episode(run, seed, age, number, value):
         return [run, "biped", "icy", "twirl", seed, age, number, "return", value]
 
     rows = [episode("a", 0, 5, 0, -1.0), episode("a", 0, 9, 0, 1.0), episode("a", 0, 9, 1, 2.0)]
     rows.append(episode("b", 1, 9, 0, 3.0))
     table = tables.read_table(write(tmp_path / "e.csv", tables.EPISODE_COLUMNS, rows))
-    assert [s.tolist() for s in aggregate.cell_strata(table, 0)] == [[1.0, 2.0], [3.0]]
+    assert [s.tolist() for s in aggregate.cell_runs(table, 0)] == [[1.0, 2.0], [3.0]]
     rows.append(episode("b", 1, 9, 0, 3.0))
     table = tables.read_table(write(tmp_path / "e.csv", tables.EPISODE_COLUMNS, rows))
     with pytest.raises(TableError, match="run 'b' has episode 0 2 times"):
-        aggregate.cell_strata(table, 0)
+        aggregate.cell_runs(table, 0)
 
 
 def test_a_rate_is_shown_by_its_mean():
-    assert aggregate.statistics_of("success") == ("rate",)
-    assert aggregate.statistics_of("eval/success") == ("rate",)
-    assert aggregate.statistics_of("return") == ("mean", "iqm")
+    facts = Facts(measures={"success": Measure(unit="share")})
+    assert aggregate.statistics_of(facts, "success") == ("rate",)
+    assert aggregate.statistics_of(facts, "eval/success") == ("rate",)
+    assert aggregate.statistics_of(facts, "return") == ("mean", "iqm")
     nine_of_ten = [np.array([1.0] * 9 + [0.0])]
     assert aggregate.estimate(nine_of_ten, "rate").estimate == pytest.approx(0.9)
     assert aggregate.estimate(nine_of_ten, "iqm").estimate == 1.0  # why a rate is not an IQM
+
+
+def test_what_leads_a_task_is_what_all_learning_runs_report(table_of):
+    def named(name, run="a", variant="twirl"):
+        return [run, "biped", "icy", variant, 0, name, 5, 0, 0.0, 1.0]
+
+    both = table_of([named("eval/return"), named("return"), named("eval/q"), named("q")])
+    assert cells.lead_metrics(both, "biped") == ["eval/return"]
+    assert cells.shown_metrics(both, "biped") == ["eval/return", "eval/q"]
+    mixed = table_of([named("eval/return"), named("return"), named("q"), named("return", "b")])
+    assert cells.shown_metrics(mixed, "biped") == ["return", "q"]
+    idle = table_of([named("eval/return"), named("return", "zero", "scripted")])
+    assert cells.lead_metrics(idle, "biped") == ["eval/return"]
+    with pytest.raises(TableError, match="run 'b' has none of 'return' for all runs"):
+        cells.lead_metrics(table_of([named("return"), named("q", "b")]), "biped")

@@ -1,15 +1,19 @@
+import dataclasses
 import io
 import subprocess
 import sys
 
 import numpy as np
 import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.lines import Line2D
 from matplotlib.patches import Rectangle
 from PIL import Image
 
 from twirl_mjx.figures import canvas, plots, style, tables
-from twirl_mjx.figures.tables import TableError, read_table
+from twirl_mjx.figures.errors import TableError
+from twirl_mjx.figures.facts import Axis, Facts
+from twirl_mjx.figures.tables import read_table
 
 
 @pytest.fixture(scope="module")
@@ -50,7 +54,6 @@ def test_every_grid_is_drawn(made):
     assert names == {
         "tasks_curves_return_mean",
         "tasks_curves_return_iqm",
-        "tasks_curves_standing_time_mean",
         "tasks_curves_standing_time_iqm",
         "shifts_bars_return_mean",
         "shifts_bars_return_iqm",
@@ -67,6 +70,84 @@ def test_every_grid_is_drawn(made):
     assert said == []
 
 
+def test_a_smoke_run_is_no_result(tmp_path, write, rows_of, facts_of):
+    rows = list(rows_of("biped", "none", "twirl", 0))
+    for name in ("small", "real"):
+        write(tmp_path / name / "a.csv", tables.CURVE_COLUMNS, rows)
+    facts_of(tmp_path / "small", smoke=True)
+    said = []
+    assert list(plots.read_grids(tmp_path, said.append)) == ["real"]
+    assert said == ["grid 'small': a smoke run is no result, no figure"]
+
+
+def test_two_settings_have_an_effect_each(tmp_path, write, rows_of):
+    rows = [
+        row
+        for tau in (0.005, 0.01)
+        for critics in (2, 10)
+        for seed in (0, 1)
+        for row in rows_of("biped", "none", "twirl", seed, extra=(tau, critics), points=3)
+    ]
+    write(tmp_path / "a.csv", [*tables.CURVE_COLUMNS, "tau", "critics"], rows)
+    curves, _ = tables.read_directory(tmp_path)
+    drawn = {d.name: d for d in plots.drawings("mine", curves, None)}
+    assert set(drawn) == {
+        f"mine_ablation_{s}_return_{k}" for s in ("tau", "critics") for k in ("mean", "iqm")
+    }
+    shown = texts(drawn["mine_ablation_tau_return_iqm"].draw("light"))
+    assert {"biped, critics = 2", "biped, critics = 10", "tau = 0.005", "tau = 0.01"} <= set(shown)
+    shown = texts(drawn["mine_ablation_critics_return_mean"].draw("light"))
+    assert {"biped, tau = 0.005", "biped, tau = 0.01", "critics = 2", "critics = 10"} <= set(shown)
+
+
+def test_what_learns_nothing_is_a_level_and_no_bar(tmp_path, write, episodes_of):
+    rows = [*episodes_of("biped", "icy", "weights", 0), *episodes_of("biped", "icy", "source", 0)]
+    table = read_table(write(tmp_path / "e.csv", tables.EPISODE_COLUMNS, rows))
+    figure = plots.shift_bars(table, "return", statistic="mean")
+    (axes,) = figure.axes
+    (bar,), (level,) = axes.patches, axes.lines
+    assert isinstance(bar, Rectangle)
+    source = tables.select(table, variant="source", metric="return")["value"].mean()
+    assert ydata(level).tolist() == [source, source]
+    assert {"weights", "source (learns nothing)"} <= set(texts(figure))
+
+
+def test_an_effect_shows_what_learns_nothing_as_a_level(tmp_path, write, rows_of):
+    rows = [
+        row
+        for phi in (0, 0.5)
+        for row in rows_of("biped", "icy", "twirl", 0, extra=(phi,), level=0.5 + phi)
+    ]
+    rows += [[*row[:10], ""] for row in rows_of("biped", "icy", "source", 0)]
+    table = read_table(write(tmp_path / "a.csv", [*tables.CURVE_COLUMNS, "phi"], rows))
+    figure = plots.ablation(table, "phi", "return")
+    assert {"phi = 0", "phi = 0.5", "source"} <= set(texts(figure))
+    level = tables.select(table, variant="source")["value"].tolist()
+    assert any(ydata(line).tolist() == level * 2 for line in figure.axes[0].lines)
+
+
+@pytest.mark.parametrize("draw", [plots.learning_curves, plots.shift_bars])
+def test_nothing_is_clipped_and_text_is_taken_as_it_is(icy, draw):
+    name = "the_share_of_hurdles_" * 6 + "$x_{$"
+    long = "$\\frac{ " + "a very long name of a variant " * 5
+    columns = {**icy.columns, "metric": np.full(len(icy), name)}
+    columns["variant"] = np.where(icy["variant"] == "twirl", long, icy["variant"])
+    columns["shift"] = np.full(len(icy), "a shift with a long name, " * 4)
+    figure = draw(tables.Table(columns, icy.notes, "mine"), name)
+    width, height = figure.get_size_inches() * figure.dpi
+    drawn = FigureCanvasAgg(figure)
+    drawn.draw()
+    renderer = drawn.get_renderer()
+    found = [*figure.texts, *(t for legend in figure.legends for t in legend.get_texts())]
+    for axes in figure.axes:
+        found += [axes._left_title, axes.xaxis.label, axes.yaxis.label, *axes.get_xticklabels()]
+    for text in found:
+        box = text.get_window_extent(renderer)
+        inside = box.x0 >= -1 and box.y0 >= -1 and box.x1 <= width + 1 and box.y1 <= height + 1
+        assert inside, (text.get_text(), box)
+    assert "$" in " ".join(texts(figure))
+
+
 def test_pictures_are_legible_in_size_and_not_blank(made):
     for path in made[0]:
         with Image.open(path) as picture:
@@ -80,7 +161,7 @@ def test_grids_without_data_are_named(tmp_path, write, rows_of):
     write(tmp_path / "mine" / "a.csv", tables.CURVE_COLUMNS, [])
     said = []
     assert list(plots.read_grids(tmp_path, said.append)) == ["tasks"]
-    assert [line.split("'")[1] for line in said] == ["shifts", "phi", "utd", "mine"]
+    assert [line.split("'")[1] for line in said] == ["mine"]
     assert all("no data in" in line for line in said)
     with pytest.raises(TableError, match=r"no such directory, expected <grid>/<arm>\.csv below it"):
         plots.read_grids(tmp_path / "nowhere")
@@ -106,7 +187,7 @@ def test_a_curve_shows_the_mean_of_its_runs_in_the_colour_of_its_variant(icy):
     (axes,) = plots.learning_curves(icy, "return", statistic="mean").axes
     part = tables.select(icy, variant="weights", metric="return")
     runs = [tables.select(part, seed=s)["value"] for s in (0, 1)]
-    colour = style.variant_mark("weights", style.theme_of("light")).colour
+    colour = style.category_mark(1, style.theme_of("light")).colour
     (line,) = [li for li in axes.lines if li.get_color() == colour and li.get_linewidth() > 1]
     np.testing.assert_allclose(ydata(line), np.mean(runs, axis=0))
     assert xdata(line)[-1] == 100_000
@@ -130,7 +211,7 @@ def test_episode_bars_pool_the_runs_of_a_variant(tmp_path, write, episodes_of):
     values = [tables.select(table, metric="success", seed=s)["value"] for s in (0, 3)]
     assert values[0].mean() != values[1].mean()
     assert bar.get_height() == pytest.approx(np.concatenate(values).mean())
-    assert "over the episodes of 2 seeds per bar" in " ".join(texts(figure))
+    assert "2 seeds and their episodes" in " ".join(texts(figure))
 
 
 def test_runs_can_be_set_side_by_side(icy):
@@ -144,7 +225,7 @@ def test_untrained_variants_are_level_lines(tmp_path, write, rows_of):
     rows = [r for v in ("scratch", "source") for r in rows_of("biped", "none", v, 0)]
     table = read_table(write(tmp_path / "a.csv", tables.CURVE_COLUMNS, rows))
     (axes,) = plots.learning_curves(table, "return").axes
-    colour = style.variant_mark("source", style.theme_of("light")).colour
+    colour = style.category_mark(1, style.theme_of("light")).colour
     (line,) = [li for li in axes.lines if li.get_color() == colour]
     assert xdata(line).tolist() == [0, 100_000]
     assert len(set(ydata(line).tolist())) == 1
@@ -183,17 +264,19 @@ def test_ablation_has_one_line_and_one_point_per_value(tmp_path, write, rows_of)
     right = figure.axes[1]
     assert [ydata(line)[0] for line in right.lines] == pytest.approx(
         [
-            tables.select(table, metric="return", env_steps=100_000, utd=u)["value"].mean()
+            tables.select(table, metric="return", env_steps=100_000, utd=str(u))["value"].mean()
             for u in (1, 20)
         ]
     )
 
 
 def test_episodes_of_an_ablation_are_not_pooled_into_bars(tmp_path, write, episodes_of):
-    rows = episodes_of("biped", "icy", "twirl", 0)
-    table = read_table(write(tmp_path / "e.csv", tables.EPISODE_COLUMNS, rows))
-    assert list(plots.drawings("shifts_reduced", None, table))
-    assert not list(plots.drawings("phi_reduced", None, table))
+    rows = list(episodes_of("biped", "icy", "twirl", 0))
+    rows = [[*row, phi] for phi in (0, 0.5) for row in rows]
+    rows = [[f"{row[0]}-{row[-1]}", *row[1:]] for row in rows]
+    table = read_table(write(tmp_path / "e.csv", [*tables.EPISODE_COLUMNS, "phi"], rows))
+    (axes,) = plots.shift_bars(table, "return").axes
+    assert len(axes.patches) == 2
 
 
 def test_unknown_names_are_refused_with_the_nearest(icy, tmp_path, write, rows_of):
@@ -201,18 +284,17 @@ def test_unknown_names_are_refused_with_the_nearest(icy, tmp_path, write, rows_o
         plots.learning_curves(icy, "retrun")
     with pytest.raises(ValueError, match=r"no theme 'drak': .*nearest: 'dark'"):
         plots.learning_curves(icy, "return", theme="drak")
-    with pytest.raises(ValueError, match=r"one line per 'varint': .*nearest: 'variant'"):
-        plots.learning_curves(icy, "return", by="varint")
-    with pytest.raises(ValueError, match=r"no ablation of 'psi': .*nearest: 'phi'"):
-        plots.ablation(icy, "psi", "return")
-    with pytest.raises(TableError, match="no column 'phi'"):
+    with pytest.raises(TableError, match="no setting 'phi': there is none"):
         plots.ablation(icy, "phi", "return")
-    rows = [[*r[:2], "iccy", "twril", *r[4:]] for r in rows_of("biped", "icy", "twirl", 0)]
-    table = read_table(write(tmp_path / "typo.csv", tables.CURVE_COLUMNS, rows))
-    with pytest.raises(ValueError, match=r"no colour for variant 'twril': .*nearest: 'twirl'"):
-        plots.learning_curves(table, "return")
-    with pytest.raises(ValueError, match=r"typo\.csv: unknown shift 'iccy': .*nearest: 'icy'"):
-        plots.shift_bars(table, "return")
+
+
+def test_a_variant_keeps_its_colour_whatever_else_is_drawn(icy):
+    facts = Facts(axes={"variant": Axis(order=("scratch", "twirl", "weights"))})
+    table = dataclasses.replace(icy, facts=facts)
+    look = style.theme_of("light")
+    for part in (table, tables.select(table, variant="weights")):
+        (axes,) = plots.learning_curves(part, "return").axes
+        assert axes.lines[-1].get_color() == style.category_mark(2, look).colour
 
 
 def test_an_empty_setting_column_is_refused(tmp_path, write, rows_of):
@@ -234,7 +316,7 @@ def test_colours_differ_and_stand_out_from_the_background(theme):
         return (high + 0.05) / (low + 0.05)
 
     look = style.theme_of(theme)
-    marks = [style.variant_mark(v, look) for v in style.VARIANTS]
+    marks = [style.category_mark(i, look) for i in range(len(look.categories))]
     assert len({m.colour for m in marks}) == len(marks)
     assert len({m.hatch for m in marks}) == len(marks)
     assert contrast(look.text, look.background) > 7

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from twirl_mjx.figures import page, report, tables
+from twirl_mjx.figures import page, report, tables, wording
+from twirl_mjx.figures.errors import TableError
 from twirl_mjx.figures.page import Media, MediaError
 from twirl_mjx.figures.statistics import Interval
-from twirl_mjx.figures.tables import TableError
 
 ADDRESSES = ("src", "srcset", "href", "data", "poster", "action", "background")
 VOID = ("meta", "link", "img", "source", "br", "input", "hr")
@@ -73,7 +73,7 @@ def test_no_address_leaves_the_file(html, elements):
 
 def test_every_picture_and_clip_decodes(elements, tmp_path):
     pictures = elements.of("img")
-    assert len(pictures) == 6  # return and success of the evaluation, curves, and the clip
+    assert len(pictures) == 5  # return in two ways: evaluation and curves; and the clip
     for attributes in pictures:
         kind, data = content(attributes["src"])
         with Image.open(io.BytesIO(data)) as picture:
@@ -119,8 +119,11 @@ def test_rows_carry_their_commands_and_numbers(html, elements):
     assert html.count("<tr>") > 12
     text = "".join(elements.text)
     assert "Reduced: 100k of 1M transitions, 2 seeds" in text
-    assert "biped: TWiRL has 2." in text
-    assert "No data yet for: shifts, phi, utd." in text
+    assert "biped: highest return " in text
+    assert "(2 runs (few)): twirl, 2." in text
+    assert " times that of scratch" in text
+    assert "source (learns nothing)" in text
+    assert "episodes (1 run)" in text  # what the interval of a single policy is over
 
 
 def test_the_page_is_the_same_each_time(tmp_path, write, rows_of):
@@ -169,8 +172,32 @@ def test_unusable_clips_are_refused(tmp_path):
 
 
 def test_numbers_are_written_alike():
-    assert report.interval_text(Interval(1446.4, 1317.6, 1594.0)) == "1,446 [1,318, 1,594]"
-    assert report.interval_text(Interval(0.5, 0.25, 0.75)) == "0.50 [0.25, 0.75]"
-    assert report.interval_text(Interval(12.34, float("nan"), float("nan"))) == "12.3"
-    assert report.numbers(float("nan")) == ["\N{EN DASH}"]
-    assert [report.duration(s) for s in (42.0, 1020.0, 7500.0)] == ["42 s", "17 min", "2 h 05 min"]
+    assert wording.interval_text(Interval(1446.4, 1317.6, 1594.0)) == "1,446 [1,318, 1,594]"
+    assert wording.interval_text(Interval(0.5, 0.25, 0.75)) == "0.50 [0.25, 0.75]"
+    assert wording.interval_text(Interval(12.34, float("nan"), float("nan"))) == "12.3"
+    assert wording.numbers(float("nan")) == ["\N{EN DASH}"]
+    assert [wording.duration(s) for s in (42.0, 1020.0, 7500.0)] == ["42 s", "17 min", "2 h 05 min"]
+
+
+def test_the_main_result_opens_the_page_and_smoke_stays_out(tmp_path, write, rows_of, facts_of):
+    rows = list(rows_of("biped", "none", "twirl", 0, points=2))
+    for name in ("a_side", "main", "small"):
+        write(tmp_path / name / "a.csv", tables.CURVE_COLUMNS, rows)
+    facts_of(tmp_path / "main", place=1, title="The main result", about="Who wins.")
+    facts_of(tmp_path / "small", place=0, smoke=True, title="A smoke run")
+    path = report.write_report(tmp_path, tmp_path / "r.html", say=lambda line: None)
+    html = path.read_text(encoding="utf-8")
+    assert 0 < html.index("The main result</h2><p>Who wins.") < html.index("Grid: a_side</h2>")
+    assert "A smoke run" not in html
+    assert "2 grids, 2 runs." in html
+
+
+def test_a_task_is_led_by_what_its_facts_say(tmp_path, write, episodes_of, facts_of):
+    rows = list(episodes_of("biped", "icy", "twirl", 0))
+    write(tmp_path / "mine" / "a.csv", tables.EPISODE_COLUMNS, rows)
+    facts_of(tmp_path / "mine", tasks={"biped": {"lead": ["success", "return"]}})
+    path = report.write_report(tmp_path, tmp_path / "r.html", say=lambda line: None)
+    html = path.read_text(encoding="utf-8")
+    first, more = html.split("Other measures")
+    assert "<caption>Success [share]. Bold" in first
+    assert '<th scope="col" class="number">Return</th>' in more

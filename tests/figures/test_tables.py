@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from twirl_mjx.figures import tables
-from twirl_mjx.figures.tables import TableError
+from twirl_mjx.figures.errors import TableError
 
 CURVE = ["a-0", "biped", "icy", "twirl", 0, "return", 1000, 20000, 12.5, 3.25]
 EPISODE = ["a-0", "biped", "icy", "twirl", 0, 1000, 7, "success", 1.0]
@@ -48,12 +48,12 @@ def test_column_order_does_not_matter_and_empty_lines_are_skipped(tmp_path, writ
     assert tables.read_table(path)["grad_steps"].tolist() == [20000]
 
 
-def test_optional_columns_may_be_empty(curve_file):
-    path = curve_file([[*CURVE, 0.5], [*CURVE, ""]], [*tables.CURVE_COLUMNS, "phi"])
-    table = tables.read_table(path)
-    assert table["phi"][0] == 0.5
-    assert math.isnan(table["phi"][1])
-    assert tables.unique(table, "phi") == [0.5]
+def test_further_columns_are_settings_and_may_be_empty(curve_file):
+    rows = [[*CURVE, cell] for cell in ("0.50", "", "10", "big", "9")]
+    table = tables.read_table(curve_file(rows, [*tables.CURVE_COLUMNS, "phi"]))
+    assert table["phi"].tolist() == ["0.5", "", "10", "big", "9"]
+    assert tables.unique(table, "phi") == ["0.5", "9", "10", "", "big"]
+    assert table.settings == ["phi"]
 
 
 def test_notes_are_read_by_key(curve_file):
@@ -100,11 +100,13 @@ def test_wrong_headers_are_refused(curve_file):
         tables.read_table(
             curve_file([CURVE[:4] + CURVE[5:]], [c for c in tables.CURVE_COLUMNS if c != "seed"])
         )
-    with pytest.raises(TableError, match=r"unknown column 'env_step': .*nearest: 'env_steps'"):
+    with pytest.raises(TableError, match="'env_steps' is missing: .*nearest: 'env_step'"):
         columns = ["env_step" if c == "env_steps" else c for c in tables.CURVE_COLUMNS]
         tables.read_table(curve_file(columns=columns))
     with pytest.raises(TableError, match="column 'value' appears 2 times"):
         tables.read_table(curve_file([[*CURVE, 1]], [*tables.CURVE_COLUMNS, "value"]))
+    with pytest.raises(TableError, match="column 'label' cannot be a setting"):
+        tables.read_table(curve_file([[*CURVE, 1]], [*tables.CURVE_COLUMNS, "label"]))
 
 
 def test_broken_files_are_refused(curve_file, tmp_path):
@@ -135,16 +137,29 @@ def test_select_keeps_matching_rows_and_names_the_nearest_choice(curve_file):
         tables.select(table, utd=1)
 
 
-def test_concatenate_fills_missing_optional_columns(tmp_path, write):
+def test_concatenate_fills_missing_settings(tmp_path, write):
     a = tables.read_table(write(tmp_path / "a.csv", tables.CURVE_COLUMNS, [CURVE]))
     columns = [*tables.CURVE_COLUMNS, "utd"]
     b = tables.read_table(write(tmp_path / "b.csv", columns, [[*CURVE, 20]]))
     joined = tables.concatenate([a, b], source="both")
-    assert math.isnan(joined["utd"][0])
-    assert joined["utd"][1] == 20
+    assert joined["utd"].tolist() == ["", "20"]
     assert joined["arm"].tolist() == ["a", "b"]
     episodes = tables.read_table(write(tmp_path / "e.csv", tables.EPISODE_COLUMNS, [EPISODE]))
     with pytest.raises(TableError, match="curve and episode tables cannot be joined"):
         tables.concatenate([a, episodes], source="both")
     with pytest.raises(TableError, match="no table to read"):
         tables.concatenate([], source="none")
+
+
+def test_a_ratio_is_computed_of_rows_alike(tmp_path, write, facts_of):
+    def rows(metric, values):
+        return [[*EPISODE[:6], i, metric, value] for i, value in enumerate(values)]
+
+    body = [*rows("clean", [1, 0, 3]), *rows("passed", [2, 0, 4]), *rows("other", [5])]
+    write(tmp_path / "a.csv", tables.EPISODE_COLUMNS, body)
+    facts_of(tmp_path, measures={"share": {"unit": "share", "ratio": ["clean", "passed"]}})
+    _, episodes = tables.read_directory(tmp_path)
+    assert episodes is not None
+    share = tables.select(episodes, metric="share")
+    assert share["episode"].tolist() == [0, 2]  # nothing passed: not measured
+    assert share["value"].tolist() == [0.5, 0.75]

@@ -3,16 +3,23 @@
 from __future__ import annotations
 
 import dataclasses
+import re
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from twirl_mjx.figures.summary import main_metric, summarise
+from twirl_mjx.figures.cells import lead_metrics
+from twirl_mjx.figures.plots import make_figures, read_grids
+from twirl_mjx.figures.report import write_report
+from twirl_mjx.figures.summary import summarise
 from twirl_mjx.figures.tables import read_curves, read_directory, read_episodes
-from twirl_mjx.sweep.gather import gather, nominal_notes, thin
-from twirl_mjx.sweep.grid import Grid, load
+from twirl_mjx.sweep.describe import describe
+from twirl_mjx.sweep.gather import gather, nominal_notes, settings_of, thin
+from twirl_mjx.sweep.grid import Grid, grids_folder, load
 from twirl_mjx.sweep.plan import Cell, make_plan
 
 Finish = Callable[..., Path]
@@ -44,7 +51,7 @@ def test_tables_of_a_finished_grid(
 
     curves = read_curves(folder / "biped-phi0.5.csv")
     assert set(curves["metric"]) == {"eval/return"}
-    assert set(curves["phi"]) == {0.5}
+    assert set(curves["phi"]) == {"0.5"}
     for seed in (0, 1):
         rows = curves["seed"] == seed
         assert rows.sum() == 100
@@ -53,8 +60,9 @@ def test_tables_of_a_finished_grid(
             curves["value"][rows], seed + curves["env_steps"][rows] / 1000, rtol=1e-5
         )
     episodes = read_episodes(folder / "biped-phi0.5.episodes.csv")
-    assert sorted(set(episodes["metric"])) == ["episode_length", "return"]
-    assert len(episodes) == 2 * 2 * 4
+    # what the run measures of episodes, listed nowhere
+    assert sorted(set(episodes["metric"])) == ["episode_length", "return", "unlisted"]
+    assert len(episodes) == 2 * 3 * 4
 
 
 def test_figures_find_what_they_need(
@@ -66,10 +74,10 @@ def test_figures_find_what_they_need(
     gather(grid, cells, tmp_path / "runs", tmp_path / "results")
     curves, episodes = read_directory(tmp_path / "results" / "phi_reduced")
     assert curves is not None and episodes is not None
-    assert main_metric(curves) == "eval/return"
+    assert lead_metrics(curves, "biped") == ["eval/return"]
     rows = {s.label: s for s in summarise(curves, "eval/return")}
-    assert rows["twirl, phi 0.25"].mean == pytest.approx(0.75)  # seeds 0 and 1, plus 0.25
-    assert rows["zero-shot"].mean == pytest.approx(1.5)  # episodes 0 to 3, at no training
+    assert rows["phi = 0.25"].mean.estimate == pytest.approx(0.75)  # seeds 0 and 1, plus 0.25
+    assert rows["zero-shot"].mean.estimate == pytest.approx(1.5)  # episodes 0 to 3, at no training
     assert rows["zero-shot"].seeds == (0,)
 
 
@@ -158,6 +166,124 @@ def test_a_changed_setting_does_not_reuse_old_runs(
     cells = make_plan(grid, tmp_path / "runs")
     written = gather(grid, cells, tmp_path / "runs", tmp_path / "results")
     assert {p.name for p in written} == {"biped-zs.csv", "biped-zs.episodes.csv"}
+
+
+def documented_grid() -> str:
+    """Return the "grid of your own" of the documentation, as it stands there."""
+    text = (grids_folder() / "README.md").read_text(encoding="utf-8")
+    (code,) = re.findall(r"```python\n(.*?)```", text.split("## A grid of your own")[1], re.S)
+    return code
+
+
+def test_the_documented_grid_of_your_own(tmp_path: Path, finish_run: Finish) -> None:
+    """From the file to tables, figures and the report; its runs are made up."""
+    path, runs, results = tmp_path / "mine.py", tmp_path / "runs", tmp_path / "results"
+    path.write_text(documented_grid())
+    grid = load(str(path))
+    assert settings_of(grid)["tau0.01-critics4"] == {"tau": "0.01", "critics": "4"}
+    cells = make_plan(grid, runs)
+    for cell in cells:
+        finish_run(cell, runs, epochs=3)
+    assert len(gather(grid, cells, runs, results)) == 2 * 4
+    header = (results / "mine" / "tau0.01-critics4.csv").read_text().splitlines()
+    assert next(line for line in header if line[0] != "#").endswith(",value,tau,critics")
+    said: list[str] = []
+    pictures = make_figures(results, tmp_path / "pictures", said.append)
+    names = {path.stem for path in pictures}
+    assert {"mine_ablation_tau_eval_return_iqm", "mine_ablation_critics_eval_return_mean"} <= names
+    assert "mine_episodes_bars_unlisted_iqm" in names  # a measure that is listed nowhere
+    page = write_report(results, tmp_path / "report.html", say=said.append).read_text()
+    assert all(f"tau = {t}, critics = {n}" in page for t in ("0.005", "0.01") for n in (2, 4))
+    assert "What you vary" in page
+    assert said == []
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1200)
+def test_the_documented_grid_for_real(tmp_path: Path) -> None:
+    code = documented_grid().replace('"cpu"', '"debug"').replace("(0, 1, 2)", "(0,)")
+    code = code.replace('"total_env_steps": 200_000', '"variant": "scratch"')
+    (tmp_path / "mine.py").write_text(code)
+    folders = ["--runs", str(tmp_path / "runs"), "--results", str(tmp_path / "results")]
+    command = [sys.executable, "-m", "twirl_mjx", "sweep", str(tmp_path / "mine.py"), *folders]
+    subprocess.run([*command, "--workers", "1"], check=True, cwd=tmp_path)
+    pictures = make_figures(tmp_path / "results", tmp_path / "pictures")
+    assert len({p.stem for p in pictures if "ablation_tau_eval_return" in p.stem}) == 2
+
+
+def grid_of(path: Path, axes: str, more: str = "") -> Grid:
+    path.write_text(
+        f'BLOCK = {{"preset": "debug", "seeds": (0,), "axes": {axes}{more}}}\nGRID = (BLOCK,)'
+    )
+    return load(str(path))
+
+
+def test_axes_that_tell_arms_apart_are_columns(tmp_path: Path) -> None:
+    task, path = '"task": {"biped": {"task": "biped"}}', tmp_path / "g.py"
+    variants = '"v": {"a": {"variant": "twirl"}, "b": {"variant": "scratch"}}'
+    assert settings_of(grid_of(path, f"{{{task}, {variants}}}")) == {"biped-a": {}, "biped-b": {}}
+    goals = '"task": {"slow": {"task": "biped"}, "fast": {"task": "biped", "droq.tau": 0.01}}'
+    assert settings_of(grid_of(path, f"{{{goals}}}")) == {
+        "slow": {"axis_task": "slow"},
+        "fast": {"axis_task": "fast"},
+    }
+    alike = '"tau": {"tau0.1": {"droq.tau": 0.1}, "0.1": {"droq.tau": 0.2}}'
+    assert settings_of(grid_of(path, f"{{{task}, {alike}}}")) == {
+        "biped-tau0.1": {"tau": "tau0.1"},
+        "biped-0.1": {"tau": "0.1"},
+    }
+
+
+def test_a_smoke_grid_gives_no_results(tmp_path: Path, finish_run: Finish) -> None:
+    axes, runs = '{"task": {"biped": {"task": "biped"}}}', tmp_path / "runs"
+    grid = grid_of(tmp_path / "g.py", axes, ', "smoke": True')
+    cells = make_plan(grid, runs)
+    for cell in cells:
+        finish_run(cell, runs)
+    written = gather(grid, cells, runs, tmp_path / "results")
+    assert not (tmp_path / "results").exists()
+    assert {p.parent for p in written} == {runs / "smoke" / "g"}
+    said: list[str] = []
+    assert read_grids(runs / "smoke", said.append) == {}
+    assert said == ["grid 'g': a smoke run is no result, no figure"]
+    mixed = (tmp_path / "g.py").read_text() + '\nGRID += (BLOCK | {"smoke": False},)'
+    (tmp_path / "g.py").write_text(mixed.replace("(BLOCK |", "({**BLOCK, 'seeds': (1,)} |"))
+    with pytest.raises(ValueError, match="some blocks are smoke, some not"):
+        load(str(tmp_path / "g.py"))
+
+
+def test_what_is_shown_of_a_grid_is_checked(tmp_path: Path) -> None:
+    axes = '{"task": {"biped": {"task": "biped"}}}'
+    path = tmp_path / "g.py"
+    grid_of(path, axes)
+    text = path.read_text()
+    path.write_text(text + '\nRESULTS = {"titel": "x"}')
+    with pytest.raises(ValueError, match="nearest: 'title'"):
+        load(str(path))
+    path.write_text(text + '\nRESULTS = {"place": "first"}')
+    with pytest.raises(ValueError, match=r"RESULTS\['place'\]"):
+        load(str(path))
+
+
+def test_tables_of_no_grid_are_described(tmp_path: Path) -> None:
+    folder = tmp_path / "mine"
+    folder.mkdir()
+    rows = ["run,task,shift,variant,seed,metric,env_steps,grad_steps,wall_s,value,tau"]
+    for task, shift in (("hurdles", "icy"), ("biped", "none"), ("mine", "none")):
+        rows += [f"{task}{tau},{task},{shift},twirl,0,return,0,0,0,1,{tau}" for tau in (10, 9)]
+    (folder / "a.csv").write_text("\n".join(rows))
+    (folder / "grid.json").write_text('{"title": "Mine", "axes": {"tau": {"title": "share"}}}')
+    describe(folder)
+    curves, _ = read_directory(folder)
+    assert curves is not None
+    facts = curves.facts
+    assert (facts.title, facts.axis_title("tau")) == ("Mine", "tau (share)")
+    assert facts.order("task") == ("biped", "hurdles", "mine")
+    assert facts.order("shift") == ("none", "icy")
+    assert facts.order("tau") == ("9", "10")
+    assert facts.lead("hurdles")[:2] == ("hurdles_passed", "single_flight")
+    assert facts.measure("min_distance").smaller_is_better
+    assert facts.label("eval/standing_time") == "Evaluation standing time [s]"
 
 
 @pytest.mark.parametrize("count", [1, 99, 100, 101, 250, 1000])

@@ -24,7 +24,7 @@ def test_expand_is_a_product_with_seeds_innermost(grid_file: Path) -> None:
         ("biped-zs", 0),
     ]  # fmt: skip
     assert [d.config.replay.phi for d in grid.drafts[:4]] == [0.25, 0.25, 0.5, 0.5]
-    assert grid.varied == {"task", "replay.phi", "variant"}
+    assert grid.drafts[0].labels == (("task", "biped"), ("phi", "phi0.25"))
 
 
 def test_seeds_can_be_chosen_but_a_single_seed_stays(grid_file: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import shutil
 from pathlib import Path
 
 from twirl_mjx.commands.console import parse, say
@@ -14,8 +15,10 @@ class FiguresOptions:
 
     results: Path = Path("experiments/results")
     """Folder with <grid>/<arm>.csv."""
-    out: Path = Path("docs/images/results")
+    out: Path = Path("runs/figures")
     """Folder of the pictures."""
+    shown: Path = Path("docs/images/results")
+    """Folder of the few that pages show: a picture that is there is replaced by the new one."""
 
 
 def main(argv: list[str]) -> int:
@@ -25,4 +28,7 @@ def main(argv: list[str]) -> int:
     options = parse(FiguresOptions, argv, "twirl figures")
     for path in make_figures(options.results, options.out):
         say(f"wrote {path}")
+        if (page := options.shown / path.name).is_file():
+            shutil.copyfile(path, page)
+            say(f"wrote {page}")
     return 0

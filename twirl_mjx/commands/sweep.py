@@ -98,7 +98,7 @@ def _gather(grid: Grid, runs: Path, options: SweepOptions) -> None:
     finished = sum(plan.is_finished(cell, runs) for cell in arms)
     say(
         f"{grid.results_name}: {finished} of {len(arms)} cells finished;"
-        f" {len(written)} tables in {results / grid.results_name}"
+        f" {len(written)} tables in {gather.tables_folder(grid, runs, results)}"
     )
 
 

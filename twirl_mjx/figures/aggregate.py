@@ -1,20 +1,22 @@
 """From rows to numbers: runs on a common axis, last values, and summaries per cell.
 
-A *cell* is what is compared: one variant (and phi, and utd) of one task under one shift; its
-samples are its seeds.
+A *cell* is what is compared: one variant (with its settings, such as phi) of one task under one
+shift; its samples are its runs, which differ by their seeds.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from twirl_mjx.checks import choose_one
+from twirl_mjx.figures.cells import groups, is_idle
+from twirl_mjx.figures.errors import TableError
+from twirl_mjx.figures.facts import Facts
 from twirl_mjx.figures.statistics import Interval, bootstrap, bootstrap_band, iqm, mean, std
-from twirl_mjx.figures.style import SHIFTS, TASKS, VARIANTS, canonical, metric_info
-from twirl_mjx.figures.tables import Table, TableError, mask, select
+from twirl_mjx.figures.tables import Table, mask, select
 
 STATISTICS = ("mean", "iqm", "rate")
 """What centre and bounds mean: ``mean``: mean and standard deviation (paper style); ``iqm``:
@@ -24,7 +26,6 @@ MAX_POINTS = 200
 """Points kept of a drawn curve."""
 
 _BOOTSTRAPPED = {"iqm": iqm, "rate": mean}
-_ORDERS: Mapping[str, tuple[str, ...]] = {"task": TASKS, "shift": SHIFTS, "variant": VARIANTS}
 
 
 @dataclass(frozen=True)
@@ -53,31 +54,6 @@ class Curve:
     """Lower edge of the band, [T]; NaN for a single run."""
     high: np.ndarray
     """Upper edge of the band, [T]; NaN for a single run."""
-
-
-def groups(table: Table, columns: Sequence[str]) -> dict[tuple, Table]:
-    """Split a table by the values of columns, in the order of figures.
-
-    Rows whose value is NaN in a grouping column belong to no group.
-
-    Args:
-        table: Any table.
-        columns: Column names.
-
-    Returns:
-        Values of the columns -> rows; only combinations that occur.
-    """
-    orders = {c: canonical(_without_nan(table[c]), _ORDERS.get(c, ())) for c in columns}
-    parts: dict[tuple, Table] = {(): table}
-    for column in columns:
-        finer = {}
-        for key, part in parts.items():
-            for value in orders[column]:
-                rows = part[column] == value
-                if rows.any():
-                    finer[(*key, value)] = mask(part, rows)
-        parts = finer
-    return parts
 
 
 def metric_rows(table: Table, metric: str) -> Table:
@@ -171,7 +147,8 @@ def seed_counts(table: Table, by: str) -> tuple[int, str]:
         table: Any rows.
         by: What a cell stands for, besides task and shift.
     """
-    cells = groups(table, ["task", "shift", by]).values()
+    learning = mask(table, ~is_idle(table))
+    cells = groups(learning if len(learning) else table, ["task", "shift", by]).values()
     counts = [len(groups(cell, ["arm", "run", "seed"])) for cell in cells]
     low, high = min(counts), max(counts)
     return high, f"{low} to {high} seeds" if low < high else f"{high} seed{'s' * (high > 1)}"
@@ -180,11 +157,12 @@ def seed_counts(table: Table, by: str) -> tuple[int, str]:
 def common_end(table: Table) -> dict[tuple, int]:
     """Return, per (task, shift), the transitions that every trained run reached.
 
-    Runs without training (the source, zero-shot) do not count. This is the moment at which
-    variants are compared: never one run's longer training against another's shorter one.
+    Runs without training (zero-shot, or a policy that learns nothing) do not count. This is the
+    moment at which arms are compared: never one run's longer training against another's shorter.
     """
     ends = {}
-    for key, part in groups(table, ["task", "shift"]).items():
+    for key, rows in groups(table, ["task", "shift"]).items():
+        part = mask(rows, ~is_idle(rows))
         lasts = [s["env_steps"].max() for s in groups(part, ["arm", "run", "seed"]).values()]
         ends[key] = int(min((last for last in lasts if last > 0), default=0))
     return ends
@@ -205,42 +183,43 @@ def final_values(series: Sequence[Series], env_steps: int) -> np.ndarray:
     return np.array([step_hold(s, np.array([env_steps]))[0] for s in series])
 
 
-def estimate(strata: Sequence[np.ndarray], statistic: str) -> Interval:
+def estimate(runs: Sequence[np.ndarray], statistic: str) -> Interval:
     """Return centre and bounds of samples by a named statistic.
 
     Args:
-        strata: Samples [n_k] per stratum.
+        runs: Samples [E_k] of every run.
         statistic: One of ``STATISTICS``.
     """
     if check_statistic(statistic) != "mean":
-        return bootstrap(strata, _BOOTSTRAPPED[statistic])
-    pooled = np.concatenate(strata)
+        return bootstrap(runs, _BOOTSTRAPPED[statistic])
+    pooled = np.concatenate(runs)
     centre, spread = float(mean(pooled)), float(std(pooled))
     return Interval(centre, centre - spread, centre + spread)
 
 
-def cell_strata(table: Table, env_steps: int) -> list[np.ndarray]:
-    """Return the samples of one cell from the rows of one metric.
+def cell_runs(table: Table, env_steps: int) -> list[np.ndarray]:
+    """Return the samples of one cell, one array per run, from the rows of one metric.
 
     Args:
         table: Rows of one metric in one cell.
-        env_steps: Moment of comparison; not used for episodes.
+        env_steps: Moment of comparison; not used for episodes, nor where nothing was trained.
 
     Returns:
-        Episodes: one stratum [E] per run, of its longest trained policy. Curves: one stratum
-        [S] with a value per run.
+        Episodes: those [E] of the run's longest trained policy. Curves: its value [1].
 
     Raises:
         TableError: If an episode appears twice or a run has no value by ``env_steps``.
     """
     if table.is_episodes:
         return [_last_episodes(part) for part in groups(table, ["seed", "run"]).values()]
-    return [final_values(run_series(table), env_steps)]
+    if is_idle(table).all():
+        env_steps = int(table["env_steps"].max())
+    return [np.array([value]) for value in final_values(run_series(table), env_steps)]
 
 
-def statistics_of(metric: str) -> tuple[str, ...]:
+def statistics_of(facts: Facts, metric: str) -> tuple[str, ...]:
     """Return the statistics in which a metric is shown."""
-    return ("rate",) if metric_info(metric).is_rate else ("mean", "iqm")
+    return ("rate",) if facts.measure(metric).is_rate else ("mean", "iqm")
 
 
 def check_statistic(statistic: str) -> str:
@@ -252,10 +231,6 @@ def check_statistic(statistic: str) -> str:
     if statistic not in STATISTICS:
         raise ValueError(f"no statistic '{statistic}': {choose_one(statistic, STATISTICS)}")
     return statistic
-
-
-def _without_nan(values: np.ndarray) -> list:
-    return (values[~np.isnan(values)] if values.dtype.kind == "f" else values).tolist()
 
 
 def _last_episodes(table: Table) -> np.ndarray:

@@ -210,6 +210,7 @@ th:first-child, td:first-child { padding-left: 0; }
 .number { text-align: right; }
 .best { font-weight: 700; }
 .bounds { display: block; color: var(--quiet); font-size: 0.92em; font-weight: 400; }
+.idle { color: var(--quiet); font-weight: 400; }
 .commands { white-space: normal; min-width: 170px; }
 code { font: 0.92em ui-monospace, "DejaVu Sans Mono", Menlo, Consolas, monospace;
   background: var(--code); padding: 1px 5px; border-radius: 4px; }

@@ -1,4 +1,4 @@
-"""Rebuild every figure from ``experiments/results/<grid>/*.csv``, and from nothing else."""
+"""Rebuild every figure from ``experiments/results/<grid>/``, and from nothing else."""
 
 from __future__ import annotations
 
@@ -11,16 +11,14 @@ from matplotlib.figure import Figure
 from twirl_mjx.figures.aggregate import statistics_of
 from twirl_mjx.figures.bars import ablation, shift_bars
 from twirl_mjx.figures.canvas import write_png
+from twirl_mjx.figures.cells import lead_metrics, ordered, shown_metrics
 from twirl_mjx.figures.curves import learning_curves
-from twirl_mjx.figures.style import metric_info
-from twirl_mjx.figures.summary import grid_kind, main_metric, shown_metrics
-from twirl_mjx.figures.tables import Table, TableError, read_directory
+from twirl_mjx.figures.errors import TableError
+from twirl_mjx.figures.facts import read_facts
+from twirl_mjx.figures.tables import Table, read_directory
 
-__all__ = ["GRIDS", "Drawing", "ablation", "drawings", "learning_curves", "make_figures"]
-__all__ += ["read_grids", "shift_bars"]
-
-GRIDS = ("tasks", "shifts", "phi", "utd")
-"""Grids of the paper; further directories are drawn as learning curves."""
+__all__ = ["Drawing", "ablation", "drawings", "learning_curves", "make_figures", "read_grids"]
+__all__ += ["shift_bars"]
 
 
 @dataclass(frozen=True)
@@ -28,15 +26,13 @@ class Drawing:
     """A figure that can be drawn from a table."""
 
     name: str
-    """File name without ending, for example ``phi_return_iqm``."""
+    """File name without ending, for example ``phi_ablation_return_iqm``."""
     kind: str
     """``curves``, ``bars`` or ``ablation``."""
     metric: str
     """Metric drawn."""
     statistic: str
     """One of ``aggregate.STATISTICS``."""
-    table: Table
-    """The rows."""
     draw: Callable[[str], Figure]
     """Function of the theme's name."""
 
@@ -44,14 +40,15 @@ class Drawing:
 def read_grids(
     results_dir: str | Path, say: Callable[[str], None] = print
 ) -> dict[str, tuple[Table | None, Table | None]]:
-    """Read every grid below a directory and say which of the paper's have no data.
+    """Read every grid below a directory and say which have no data, or are no results.
 
     Args:
         results_dir: ``experiments/results``.
-        say: Called with one line per grid without data.
+        say: Called with one line per grid that is left out.
 
     Returns:
-        Grid -> (curve rows, episode rows), the paper's grids first; None where there are none.
+        Grid -> (curve rows, episode rows), in the order of ``place``, then of names; None where
+        there are none.
 
     Raises:
         TableError: If the directory does not exist or a table is not valid.
@@ -59,85 +56,84 @@ def read_grids(
     results_dir = Path(results_dir)
     if not results_dir.is_dir():
         raise TableError(f"{results_dir}: no such directory, expected <grid>/<arm>.csv below it")
-    found = sorted(path.name for path in results_dir.iterdir() if path.is_dir())
-    kinds = {grid_kind(name) for name in found}
-    missing = [grid for grid in GRIDS if grid not in kinds]
-    order = {kind: i for i, kind in enumerate(GRIDS)}
+    found = {path.name: read_facts(path) for path in results_dir.iterdir() if path.is_dir()}
     grids = {}
-    for name in sorted(found, key=lambda name: (order.get(grid_kind(name), len(GRIDS)), name)):
-        tables = read_directory(results_dir / name)
-        if tables == (None, None):
-            missing.append(name)
+    for name in sorted(found, key=lambda name: (found[name].place, name)):
+        folder = results_dir / name
+        if found[name].smoke:
+            say(f"grid '{name}': a smoke run is no result, no figure")
+        elif (tables := read_directory(folder)) == (None, None):
+            say(f"grid '{name}': no data in {folder}, no figure")
         else:
             grids[name] = tables
-    for name in missing:
-        say(f"grid '{name}': no data in {results_dir / name}, no figure")
     return grids
 
 
-def drawings(
-    grid: str, curves: Table | None, episodes: Table | None, metric: str | None = None
-) -> Iterator[Drawing]:
-    """Yield the figures of one grid.
+def drawings(grid: str, curves: Table | None, episodes: Table | None) -> Iterator[Drawing]:
+    """Yield the figures of one grid: every measure that its rows hold.
 
-    Every grid has its main metric in the paper's style and with IQM; ``tasks`` and grids of your
-    own have curves of every headline metric; episode tables become bars, but for the ablations.
+    Curves with settings become one effect per setting that varies, other curves learning curves
+    and, where there are several shifts, bars; episodes become bars. What leads a task is drawn in
+    the paper's style (mean and deviation) as well.
 
     Args:
-        grid: Name of the grid; its first word says what kind it is.
+        grid: Name of the grid.
         curves: Curve rows.
         episodes: Episode rows.
-        metric: Main metric; None for ``summary.main_metric``.
 
     Raises:
-        TableError: If the runs have no main metric in common.
+        TableError: If the runs of a task have no measure in common.
     """
-    kind = grid_kind(grid)
     for table in (curves, episodes):
         if table is None:
             continue
-        main = metric or main_metric(table)
-        every = [m for m in shown_metrics(table, main) if _is_drawn(m, main)]
-        if kind in ("phi", "utd"):  # bars would pool the episodes of different values
-            wanted = [] if table.is_episodes else [("ablation", main)]
-        elif table.is_episodes:
-            wanted = [("bars", name) for name in every]
-        elif kind == "shifts":
-            wanted = [("bars", main), ("curves", main)]
-        else:
-            wanted = [("curves", name) for name in every]
-        for shape, name, statistic in ((*w, s) for w in wanted for s in statistics_of(w[1])):
-            start = f"{grid}_episodes" if table.is_episodes else grid
-            file = f"{start}_{shape}_{_slug(name)}_{statistic}"
-            yield _drawing(file, shape, name, statistic, table, kind)
+        start = f"{grid}_episodes" if table.is_episodes else grid
+        tasks = ordered(table, "task")
+        leads = {metric for task in tasks for metric in lead_metrics(table, task)}
+        metrics = dict.fromkeys(m for task in tasks for m in shown_metrics(table, task))
+        kinds = _kinds(table)
+        several = [column for _, column in kinds if column][1:]
+        for kind, column in kinds:
+            words = [start, kind, *([_slug(column)] if several else [])]
+            for metric in metrics:
+                shown = statistics_of(table.facts, metric)
+                for statistic in shown if metric in leads else shown[-1:]:
+                    name = "_".join([*words, _slug(metric), statistic])
+                    yield _drawing(name, kind, metric, statistic, table, column)
 
 
 def make_figures(
-    results_dir: str | Path,
-    output_dir: str | Path,
-    metric: str | None = None,
-    say: Callable[[str], None] = print,
+    results_dir: str | Path, output_dir: str | Path, say: Callable[[str], None] = print
 ) -> list[Path]:
     """Draw every figure of every grid as PNG.
 
     Args:
         results_dir: ``experiments/results``, with ``<grid>/<arm>.csv`` below it.
         output_dir: Directory of the pictures, made if needed.
-        metric: Main metric; None for ``summary.main_metric``.
-        say: Called with one line per grid without data.
+        say: Called with one line per grid that is left out.
 
     Returns:
         The files written, ``<output_dir>/<grid>_<kind>_<metric>_<statistic>.png``.
 
     Raises:
-        TableError: If a table is not valid or lacks the main metric.
+        TableError: If a table is not valid.
     """
     paths = []
     for grid, (curves, episodes) in read_grids(results_dir, say).items():
-        for drawing in drawings(grid, curves, episodes, metric):
+        for drawing in drawings(grid, curves, episodes):
             path = Path(output_dir) / f"{drawing.name}.png"
             paths.append(write_png(drawing.draw("light"), path))
     return paths
+
+
+def _kinds(table: Table) -> list[tuple[str, str]]:
+    """Return (kind, setting drawn or empty) of the figures of a table."""
+    varied = [c for c in table.settings if len({*ordered(table, c)} - {""}) > 1]
+    if table.is_episodes:
+        return [("bars", "")]
+    if varied:
+        return [("ablation", column) for column in varied]
+    return [("curves", ""), *([("bars", "")] if len(ordered(table, "shift")) > 1 else [])]
 
 
 def _drawing(
@@ -149,12 +145,8 @@ def _drawing(
         function = shift_bars if kind == "bars" else learning_curves
         return function(table, metric, statistic=statistic, theme=theme)
 
-    return Drawing(name, kind, metric, statistic, table, draw)
+    return Drawing(name, kind, metric, statistic, draw)
 
 
-def _is_drawn(metric: str, main: str) -> bool:
-    return metric == main or metric_info(metric).is_headline
-
-
-def _slug(metric: str) -> str:
-    return "".join(c if c.isalnum() else "_" for c in metric)
+def _slug(text: str) -> str:
+    return "".join(c if c.isalnum() else "_" for c in text)

@@ -1,15 +1,17 @@
-"""Statistics for a handful of seeds: robust averages with bootstrap intervals.
+"""Statistics for a handful of runs: robust averages with two-level bootstrap intervals.
 
-With three to five runs a mean says little and a standard deviation less, so results carry the
-interquartile mean and a 95 % stratified bootstrap interval as well (Agarwal et al. 2021, "Deep
-reinforcement learning at the edge of the statistical precipice"). A *stratum* is a set of
-exchangeable samples, for example the seeds of one task; resampling never moves a sample from one
-stratum to another. Everything is plain numpy with a fixed seed, so a figure is the same each time.
+Runs differ by their seeds and a run's episodes by theirs, so a resample first draws runs, then
+episodes within every drawn run (Davison and Hinkley 1997, "Bootstrap Methods", section 3.8);
+scipy's bootstrap does not nest. A single run says nothing about other seeds: its interval is over
+its episodes only, and says so. A *sample* here is one array per run: its episodes, or the one value
+of a curve. Averages are the mean and the interquartile mean (Agarwal et al. 2021, "Deep
+reinforcement learning at the edge of the statistical precipice"). Plain numpy with a fixed seed, so
+that a figure is the same each time.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,9 +20,8 @@ RESAMPLES = 2000
 """Bootstrap resamples: a 95 % bound then moves by about 0.05 standard errors between seeds."""
 CONFIDENCE = 0.95
 """Probability mass between the two bounds of an interval."""
-
-Statistic = Callable[..., np.ndarray]
-"""Function (samples [..., n], axis=-1) -> [...]."""
+FEW_RUNS = 5
+"""Below so many runs the bounds are close to, and for two or three equal to, their range."""
 
 
 @dataclass(frozen=True)
@@ -30,34 +31,53 @@ class Interval:
     estimate: float
     """The statistic of the samples themselves."""
     low: float
-    """Lower bound; NaN where a single sample allows no interval."""
+    """Lower bound; NaN where a single value allows no interval."""
     high: float
-    """Upper bound; NaN where a single sample allows no interval."""
+    """Upper bound; NaN where a single value allows no interval."""
+    over: str = ""
+    """What was drawn anew: ``runs``, ``runs and episodes``, ``episodes`` (of a single run);
+    empty without an interval."""
 
 
-def iqm(samples: np.ndarray, axis: int = -1) -> np.ndarray:
-    """Return the interquartile mean: the mean without the lowest and highest quarter.
+@dataclass(frozen=True)
+class TrimmedMean:
+    """The mean without a share of the lowest and as many of the highest samples."""
 
-    The number cut at each end is floor(n / 4), as in ``scipy.stats.trim_mean(samples, 0.25)``; so
-    fewer than four samples give the mean.
+    share: float
+    """Share cut at each end, in [0, 0.5); floor(share * n) samples."""
 
-    Args:
-        samples: Values [..., n].
-        axis: The axis of length n.
-    """
-    values = np.sort(_filled(samples, axis), axis=-1)
-    cut = values.shape[-1] // 4
-    return values[..., cut : values.shape[-1] - cut].mean(axis=-1)
+    def __call__(self, samples: np.ndarray, axis: int = -1) -> np.ndarray:
+        """Return the trimmed mean along an axis.
+
+        Raises:
+            ValueError: If the axis is empty.
+        """
+        values = np.sort(_filled(samples, axis), axis=-1)
+        cut = int(values.shape[-1] * self.share)
+        return values[..., cut : values.shape[-1] - cut].mean(axis=-1)
+
+    def of_counts(self, values: np.ndarray, counts: np.ndarray) -> np.ndarray:
+        """Return the trimmed mean of every resample, given how often it holds each value.
+
+        Args:
+            values: Samples [n].
+            counts: Times each was drawn, [R, n].
+
+        Returns:
+            One mean per resample, [R].
+        """
+        order = np.argsort(values, kind="stable")
+        total = counts.sum(axis=-1, keepdims=True)
+        cut = (total * self.share).astype(np.int64)
+        below = np.clip(np.cumsum(counts[:, order], axis=-1), cut, total - cut)
+        kept = np.diff(below, axis=-1, prepend=cut)
+        return kept @ values[order] / (total - 2 * cut)[:, 0]
 
 
-def mean(samples: np.ndarray, axis: int = -1) -> np.ndarray:
-    """Return the mean along an axis."""
-    return _filled(samples, axis).mean(axis=-1)
-
-
-def median(samples: np.ndarray, axis: int = -1) -> np.ndarray:
-    """Return the median along an axis."""
-    return np.median(_filled(samples, axis), axis=-1)
+mean = TrimmedMean(0.0)
+"""The mean along an axis."""
+iqm = TrimmedMean(0.25)
+"""The interquartile mean, as ``scipy.stats.trim_mean(x, 0.25)``; the mean below four samples."""
 
 
 def std(samples: np.ndarray, axis: int = -1) -> np.ndarray:
@@ -69,42 +89,38 @@ def std(samples: np.ndarray, axis: int = -1) -> np.ndarray:
 
 
 def bootstrap(
-    strata: Sequence[np.ndarray],
-    statistic: Statistic = iqm,
+    runs: Sequence[np.ndarray],
+    statistic: TrimmedMean = iqm,
     *,
     resamples: int = RESAMPLES,
     confidence: float = CONFIDENCE,
     seed: int = 0,
 ) -> Interval:
-    """Return a statistic of pooled samples with its stratified percentile interval.
+    """Return a statistic of all samples with its two-level percentile interval.
 
     Args:
-        strata: One array [n_k] per stratum; every resample draws n_k of stratum k, with
-            replacement.
-        statistic: Function of the pooled samples [..., sum n_k] along the last axis.
+        runs: Samples [E_k] of every run.
+        statistic: What to compute of the pooled samples.
         resamples: Number of resamples.
         confidence: Probability mass of the interval, in (0, 1).
         seed: Seed of the generator.
 
-    Returns:
-        The estimate and its bounds; the bounds are NaN if a stratum has one sample only.
-
     Raises:
-        ValueError: If there is no stratum, one is empty, or a number is out of range.
+        ValueError: If there is no run, one is empty, or a number is out of range.
     """
-    arrays = _check_strata(strata)
+    arrays = _check_runs(runs)
     _check_numbers(resamples, confidence)
-    estimate = float(statistic(np.concatenate(arrays), axis=-1))
-    if min(len(array) for array in arrays) < 2:
+    values = np.concatenate(arrays)
+    estimate = float(statistic(values))
+    if not (over := drawn(arrays)):
         return Interval(estimate, np.nan, np.nan)
-    rng = np.random.default_rng(seed)
-    draws = [array[_draw(rng, resamples, len(array))] for array in arrays]
-    return _percentiles(estimate, statistic(np.concatenate(draws, axis=-1), axis=-1), confidence)
+    counts = _counts(np.random.default_rng(seed), arrays, resamples)
+    return _percentiles(estimate, statistic.of_counts(values, counts), confidence, over)
 
 
 def bootstrap_band(
     values: np.ndarray,
-    statistic: Statistic = iqm,
+    statistic: TrimmedMean = iqm,
     *,
     resamples: int = RESAMPLES,
     confidence: float = CONFIDENCE,
@@ -116,7 +132,7 @@ def bootstrap_band(
 
     Args:
         values: One curve per run, [S, T].
-        statistic: Function of [..., S] along an axis.
+        statistic: What to compute over the runs.
         resamples: Number of resamples.
         confidence: Probability mass of the interval, in (0, 1).
         seed: Seed of the generator.
@@ -133,11 +149,10 @@ def bootstrap_band(
     if values.shape[0] < 2:
         empty = np.full(values.shape[1], np.nan)
         return empty, empty.copy()
-    rows = _draw(np.random.default_rng(seed), resamples, values.shape[0])
+    counts = _counts(np.random.default_rng(seed), list(values[:, :1]), resamples)
     tail = 50 * (1 - confidence)
-    low, high = np.empty(values.shape[1]), np.empty(values.shape[1])
-    for t, column in enumerate(values.T):  # one moment at a time bounds the memory to [R, S]
-        low[t], high[t] = np.percentile(statistic(column[rows], axis=-1), [tail, 100 - tail])
+    draws = np.stack([statistic.of_counts(column, counts) for column in values.T])
+    low, high = np.percentile(draws, [tail, 100 - tail], axis=-1)
     return low, high
 
 
@@ -149,79 +164,89 @@ def probability_of_improvement(
     confidence: float = CONFIDENCE,
     seed: int = 0,
 ) -> Interval:
-    """Return P(X > Y) + P(X = Y) / 2 for random samples X and Y, averaged over strata.
+    """Return P(X > Y) + P(X = Y) / 2 for random samples X and Y.
 
-    For one stratum this is the Mann-Whitney U statistic over n m. The interval is a stratified
-    percentile bootstrap in which both sides are drawn anew.
+    This is the Mann-Whitney U statistic over n m. In the interval both sides are drawn anew, runs
+    first, then episodes.
 
     Args:
-        better: Samples [n_k] of X, one array per stratum.
-        baseline: Samples [m_k] of Y, for the same strata.
+        better: Samples [E_k] of X, one array per run.
+        baseline: Samples [F_k] of Y, one array per run.
         resamples: Number of resamples.
         confidence: Probability mass of the interval, in (0, 1).
         seed: Seed of the generator.
 
     Raises:
-        ValueError: If the two sides differ in their number of strata, a stratum is empty, or a
-            number is out of range.
+        ValueError: If a side has no run, a run is empty, or a number is out of range.
     """
-    xs, ys = _check_strata(better), _check_strata(baseline)
+    xs, ys = _check_runs(better), _check_runs(baseline)
     _check_numbers(resamples, confidence)
-    if len(xs) != len(ys):
-        raise ValueError(f"{len(xs)} strata against {len(ys)}, expected the same strata")
-    wins = [_wins(x, y) for x, y in zip(xs, ys, strict=True)]
-    estimate = float(np.mean([win.mean() for win in wins]))
-    if min(len(array) for array in (*xs, *ys)) < 2:
+    x, y = np.concatenate(xs), np.concatenate(ys)
+    wins = (x[:, None] > y) + 0.5 * (x[:, None] == y)
+    estimate = float(wins.mean())
+    if not (over := _both(xs, ys)):
         return Interval(estimate, np.nan, np.nan)
     rng = np.random.default_rng(seed)
-    total = np.zeros(resamples)
-    for win in wins:
-        x_share = _draw_shares(rng, resamples, win.shape[0])
-        y_share = _draw_shares(rng, resamples, win.shape[1])
-        total += ((x_share @ win) * y_share).sum(axis=-1)
-    return _percentiles(estimate, total / len(wins), confidence)
+    x_counts, y_counts = _counts(rng, xs, resamples), _counts(rng, ys, resamples)
+    draws = ((x_counts @ wins) * y_counts).sum(axis=-1)
+    draws = draws / (x_counts.sum(axis=-1) * y_counts.sum(axis=-1))
+    return _percentiles(estimate, draws, confidence, over)
 
 
 def ratio(
-    samples: np.ndarray,
-    baseline: np.ndarray,
-    statistic: Statistic = iqm,
+    runs: Sequence[np.ndarray],
+    baseline: Sequence[np.ndarray],
+    statistic: TrimmedMean = iqm,
     *,
     resamples: int = RESAMPLES,
     confidence: float = CONFIDENCE,
     seed: int = 0,
 ) -> Interval:
-    """Return statistic(samples) / statistic(baseline) with its percentile interval.
+    """Return statistic(runs) / statistic(baseline) with its two-level percentile interval.
 
     Absolute returns depend on details of a task, ratios less so. A ratio needs a positive
     denominator: where the baseline's statistic is not, the result is NaN; where that of some
     resamples is not, the bounds are NaN.
 
     Args:
-        samples: Values [n].
-        baseline: Values [m], drawn independently of ``samples``.
-        statistic: Function of [..., n] along the last axis.
+        runs: Samples [E_k], one array per run.
+        baseline: Samples [F_k], one array per run, drawn independently of ``runs``.
+        statistic: What to compute of the pooled samples of a side.
         resamples: Number of resamples.
         confidence: Probability mass of the interval, in (0, 1).
         seed: Seed of the generator.
 
     Raises:
-        ValueError: If a side is empty or a number is out of range.
+        ValueError: If a side has no run, a run is empty, or a number is out of range.
     """
-    x, y = _check_strata([samples, baseline])
+    xs, ys = _check_runs(runs), _check_runs(baseline)
     _check_numbers(resamples, confidence)
-    below = float(statistic(y, axis=-1))
+    x, y = np.concatenate(xs), np.concatenate(ys)
+    below = float(statistic(y))
     if not below > 0:
         return Interval(np.nan, np.nan, np.nan)
-    estimate = float(statistic(x, axis=-1)) / below
-    if min(len(x), len(y)) < 2:
+    estimate = float(statistic(x)) / below
+    if not (over := _both(xs, ys)):
         return Interval(estimate, np.nan, np.nan)
     rng = np.random.default_rng(seed)
-    above = statistic(x[_draw(rng, resamples, len(x))], axis=-1)
-    under = statistic(y[_draw(rng, resamples, len(y))], axis=-1)
+    above = statistic.of_counts(x, _counts(rng, xs, resamples))
+    under = statistic.of_counts(y, _counts(rng, ys, resamples))
     if not (under > 0).all():
         return Interval(estimate, np.nan, np.nan)
-    return _percentiles(estimate, above / under, confidence)
+    return _percentiles(estimate, above / under, confidence, over)
+
+
+def drawn(runs: Sequence[np.ndarray]) -> str:
+    """Return what a resample draws anew: runs, episodes, both, or nothing (empty)."""
+    parts = ["runs"] if len(runs) > 1 else []
+    parts += ["episodes"] if max(len(run) for run in runs) > 1 else []
+    return " and ".join(parts)
+
+
+def _both(xs: Sequence[np.ndarray], ys: Sequence[np.ndarray]) -> str:
+    """Return what two sides draw anew: the narrower of the two; empty if one draws nothing."""
+    overs = sorted((drawn(xs), drawn(ys)), key=lambda over: ("runs" in over, over))
+    return overs[0] if all(overs) else ""
 
 
 def _filled(samples: np.ndarray, axis: int) -> np.ndarray:
@@ -231,11 +256,11 @@ def _filled(samples: np.ndarray, axis: int) -> np.ndarray:
     return values
 
 
-def _check_strata(strata: Sequence[np.ndarray]) -> list[np.ndarray]:
-    arrays = [np.asarray(array, np.float64).ravel() for array in strata]
+def _check_runs(runs: Sequence[np.ndarray]) -> list[np.ndarray]:
+    arrays = [np.asarray(array, np.float64).ravel() for array in runs]
     if not arrays or min(len(array) for array in arrays) < 1:
         sizes = [len(array) for array in arrays]
-        raise ValueError(f"strata of sizes {sizes}, expected at least one sample in each")
+        raise ValueError(f"runs of sizes {sizes}, expected at least one sample in each")
     if any(np.isnan(array).any() for array in arrays):
         raise ValueError("a sample is NaN; leave unmeasured values out first")
     return arrays
@@ -248,20 +273,26 @@ def _check_numbers(resamples: int, confidence: float) -> None:
         raise ValueError(f"confidence is {confidence}, expected a value in (0, 1), such as 0.95")
 
 
-def _draw(rng: np.random.Generator, resamples: int, size: int) -> np.ndarray:
-    return rng.integers(size, size=(resamples, size))
+def _counts(rng: np.random.Generator, runs: Sequence[np.ndarray], resamples: int) -> np.ndarray:
+    """Return how often each pooled sample is drawn: runs first, then samples within each.
+
+    Returns:
+        Counts [resamples, sum E_k]: a run that was drawn c times has c E_k samples.
+    """
+    chosen = rng.integers(len(runs), size=(resamples, len(runs)))
+    size = sum(len(run) for run in runs)
+    counts = np.zeros(resamples * size, np.int64)
+    offset = 0
+    for k, run in enumerate(runs):
+        draws = (chosen == k).sum(axis=-1) * len(run)
+        rows = np.repeat(np.arange(resamples), draws)
+        columns = offset + rng.integers(len(run), size=len(rows))
+        counts += np.bincount(rows * size + columns, minlength=resamples * size)
+        offset += len(run)
+    return counts.reshape(resamples, size)
 
 
-def _draw_shares(rng: np.random.Generator, resamples: int, size: int) -> np.ndarray:
-    """Return how often each sample is drawn, as a share: [resamples, size], rows sum to 1."""
-    return rng.multinomial(size, np.full(size, 1 / size), size=resamples) / size
-
-
-def _wins(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    return (x[:, None] > y) + 0.5 * (x[:, None] == y)
-
-
-def _percentiles(estimate: float, draws: np.ndarray, confidence: float) -> Interval:
+def _percentiles(estimate: float, draws: np.ndarray, confidence: float, over: str) -> Interval:
     tail = 50 * (1 - confidence)
     low, high = np.percentile(draws, [tail, 100 - tail])
-    return Interval(estimate, float(low), float(high))
+    return Interval(estimate, float(low), float(high), over)

@@ -1,4 +1,4 @@
-"""One look for every figure: sizes, two themes, and a fixed colour per variant.
+"""One look for every figure: sizes, two themes, and a colour per place in an order.
 
 Colours are those of Okabe and Ito ("Color universal design", 2008), which stay apart for the common
 forms of colour blindness; line style, marker and hatch repeat the same information for print.
@@ -6,62 +6,11 @@ forms of colour blindness; line style, marker and hatch repeat the same informat
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 from matplotlib import colormaps
 from matplotlib.colors import to_hex
-
-from twirl_mjx.checks import choose_one
-
-TASKS = ("stand", "biped", "imitate", "hurdles")
-"""Tasks in the order of figures and tables."""
-SHIFTS = ("none", "bumpy", "icy", "weakened", "sloped", "gravity")
-"""Dynamics shifts in the order of figures and tables."""
-VARIANTS = ("twirl", "twirl+weights", "weights", "zero-shot", "scratch", "source")
-"""Variants in the order of figures and tables."""
-
-
-@dataclass(frozen=True)
-class Metric:
-    """How a metric is written in figures and tables."""
-
-    label: str
-    """Name for people, lower case."""
-    unit: str = ""
-    """Unit; empty for counts, shares and returns."""
-    higher_is_better: bool = True
-    """Direction of improvement."""
-    is_headline: bool = False
-    """Whether it has figures of its own; the others are in tables only."""
-    is_rate: bool = False
-    """Whether an episode has 0 or 1, so that quartiles mean nothing and the mean is shown."""
-
-
-METRICS = {
-    "return": Metric("return", is_headline=True),
-    "success": Metric("success rate", is_headline=True, is_rate=True),
-    "standing_time": Metric("standing time", "s", is_headline=True),
-    "min_distance": Metric("minimum distance to goal", "m", False, is_headline=True),
-    "leaps": Metric("leap cycles", is_headline=True),
-    "tracking": Metric("share of the highest tracking reward"),
-    "hurdles_passed": Metric("hurdles passed", is_headline=True),
-    "clean_clearances": Metric("hurdles cleared in one flight", is_headline=True),
-    "hit_hurdle": Metric("hurdle hits per episode", "", False, is_rate=True),
-    "fall": Metric("falls per episode", "", False, is_rate=True),
-    "terminated": Metric("early ends per episode", "", False, is_rate=True),
-    "terminated_share": Metric("share of episodes ended early", "", False),
-    "forward_speed": Metric("forward speed", "m/s"),
-    "episode_length": Metric("episode length", "control steps"),
-}
-"""Metrics with a written name; any other metric is shown under its own name."""
-
-EVALUATION = "eval/"
-"""Prefix of a metric measured during training, but with the deterministic policy on own seeds."""
-
-MAIN_METRICS = (f"{EVALUATION}return", "return")
-"""What a grid is judged by: the first of these that all of its runs report."""
 
 
 @dataclass(frozen=True)
@@ -88,8 +37,8 @@ class Theme:
     """Text, ticks and error bars."""
     faint: str
     """Grid and spines."""
-    variants: tuple[str, ...]
-    """One colour per entry of ``VARIANTS``."""
+    categories: tuple[str, ...]
+    """One colour per place in an order of names, such as variants."""
     sequence: tuple[float, float]
     """Part of the viridis map used for ordered values such as phi."""
 
@@ -99,22 +48,29 @@ THEMES = {
         background="#ffffff",
         text="#1f2328",
         faint="#d4d9df",
-        variants=("#0072b2", "#e69f00", "#009e73", "#d55e00", "#b0558b", "#57606a"),
+        categories=(
+            *("#0072b2", "#e69f00", "#009e73", "#d55e00", "#b0558b", "#57606a"),
+            "#1f2328",
+        ),
         sequence=(0.0, 0.82),
     ),
     "dark": Theme(
         background="#161b22",
         text="#e6edf3",
         faint="#39424e",
-        variants=("#56b4e9", "#f0b429", "#2fc79b", "#ff8a4c", "#e39ac8", "#b1bac4"),
+        categories=(
+            *("#56b4e9", "#f0b429", "#2fc79b", "#ff8a4c", "#e39ac8", "#b1bac4"),
+            "#e6edf3",
+        ),
         sequence=(0.3, 1.0),
     ),
 }
 """Theme name -> colours."""
 
-_LINES: tuple[Any, ...] = ("-", (0, (6, 1.5)), (0, (4, 1.2, 1, 1.2)), (0, (1, 1)), "-", (0, (1, 1)))
-_MARKERS = ("o", "s", "^", "D", "v", "P")
-_HATCHES = ("", "///", "...", "\\\\\\", "xxx", "|||")
+_DASHES, _DOTS = (0, (6, 1.5)), (0, (1, 1))
+_LINES: tuple[Any, ...] = ("-", _DASHES, (0, (4, 1.2, 1, 1.2)), _DOTS, "-", _DOTS, _DASHES)
+_MARKERS = ("o", "s", "^", "D", "v", "P", "X")
+_HATCHES = ("", "///", "...", "\\\\\\", "xxx", "|||", "---")
 
 
 def theme_of(name: str) -> Theme:
@@ -128,16 +84,10 @@ def theme_of(name: str) -> Theme:
     return THEMES[name]
 
 
-def variant_mark(variant: str, theme: Theme) -> Mark:
-    """Return the fixed look of a variant.
-
-    Raises:
-        ValueError: If the variant has none.
-    """
-    if variant not in VARIANTS:
-        raise ValueError(f"no colour for variant '{variant}': {choose_one(variant, VARIANTS)}")
-    i = VARIANTS.index(variant)
-    return Mark(theme.variants[i], _LINES[i], _MARKERS[i], _HATCHES[i])
+def category_mark(index: int, theme: Theme) -> Mark:
+    """Return the look of the ``index``-th of some names; there are seven, then they repeat."""
+    i = index % len(theme.categories)
+    return Mark(theme.categories[i], _LINES[i], _MARKERS[i], _HATCHES[i])
 
 
 def ordered_mark(index: int, count: int, theme: Theme) -> Mark:
@@ -147,28 +97,6 @@ def ordered_mark(index: int, count: int, theme: Theme) -> Mark:
     colour = to_hex(colormaps["viridis"](share))
     i = index % len(_MARKERS)
     return Mark(colour, _LINES[i], _MARKERS[i], _HATCHES[i])
-
-
-def metric_info(name: str) -> Metric:
-    """Return how a metric is written; an unlisted one is written as it is called."""
-    if name.startswith(EVALUATION):
-        plain = metric_info(name.removeprefix(EVALUATION))
-        return replace(plain, label=f"evaluation {plain.label}")
-    return METRICS.get(name, Metric(name.replace("_", " ")))
-
-
-def metric_label(name: str) -> str:
-    """Return the axis label of a metric, with its unit."""
-    metric = metric_info(name)
-    text = metric.label[:1].upper() + metric.label[1:]
-    return f"{text} [{metric.unit}]" if metric.unit else text
-
-
-def canonical(values: Iterable, order: tuple[str, ...] = ()) -> list:
-    """Sort values: those of ``order`` first, as listed there, then the rest by value."""
-    distinct = set(values)
-    known = [value for value in order if value in distinct]
-    return known + sorted(distinct - set(order))
 
 
 def short_count(value: float) -> str:
@@ -207,7 +135,7 @@ def rc_params(theme: Theme) -> dict[str, Any]:
         "xtick.major.width": 0.7,
         "ytick.major.width": 0.7,
         "text.color": theme.text,
-        "text.parse_math": False,  # names in tables are shown as they are
+        "text.parse_math": False,  # names come from tables: a dollar is a dollar
         "figure.facecolor": theme.background,
         "figure.dpi": 100,
         "savefig.facecolor": theme.background,

@@ -5,9 +5,12 @@ Two kinds of table exist. A *curve* table has one row per metric and moment of t
 per metric and evaluated episode (``eval.csv``). Both are plain CSV, so that every figure can be
 rebuilt by anyone, without an accelerator and without the code that made the numbers.
 
+Any further column is a *setting*: what tells apart arms that task, shift and variant do not, such
+as ``phi``. Its cells are text, empty where an arm does not have it.
+
 A table may open with comment lines ``# key: text``. Two keys mean something to the figures:
 ``reduced`` (the run was smaller than the paper's, and how) and ``command`` (the command that makes
-the rows again).
+the rows again). What more there is to know stands in ``grid.json`` beside the tables (``facts``).
 """
 
 from __future__ import annotations
@@ -15,13 +18,15 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
 from twirl_mjx import files
 from twirl_mjx.checks import choose_one
+from twirl_mjx.figures.errors import TableError
+from twirl_mjx.figures.facts import EVALUATION, Facts, read_facts, sort_key
 
 CURVE_COLUMNS = (
     "run",
@@ -50,19 +55,15 @@ EPISODE_COLUMNS = (
 )
 """Columns of an episode table; ``env_steps`` is the age of the evaluated policy."""
 
-OPTIONAL_COLUMNS = ("phi", "utd")
-"""Columns that either kind may add: share of source rows in a minibatch, updates per transition."""
-
 ARM_COLUMN = "arm"
 """Column added while reading: the file name without its ending."""
+LABEL_COLUMN = "label"
+"""Column added for figures: what a line or bar stands for (``aggregate.labelled``)."""
 
 _COUNTS = ("seed", "env_steps", "grad_steps", "episode")
-_NUMBERS = ("wall_s", "value", *OPTIONAL_COLUMNS)
-_MAY_BE_EMPTY = OPTIONAL_COLUMNS
-
-
-class TableError(ValueError):
-    """A result table is not what it should be; the message names the file, row and remedy."""
+_NUMBERS = ("wall_s", "value")
+_ADDED = (ARM_COLUMN, LABEL_COLUMN)
+_STANDARD = {*CURVE_COLUMNS, *EPISODE_COLUMNS}
 
 
 @dataclass(frozen=True)
@@ -82,11 +83,13 @@ class Table:
     """A validated table, column by column."""
 
     columns: Mapping[str, np.ndarray]
-    """Name -> values [R]: text as str, counts as int64, other numbers as float64."""
+    """Name -> values [R]: text as str, counts as int64, value and wall time as float64."""
     notes: tuple[Note, ...] = ()
     """Comment lines, in reading order."""
     source: str = ""
     """The file or directory the rows came from, for error messages."""
+    facts: Facts = field(default_factory=Facts)
+    """What its folder says of axes and measures."""
 
     def __len__(self) -> int:
         return len(next(iter(self.columns.values()), ()))
@@ -101,6 +104,11 @@ class Table:
     def is_episodes(self) -> bool:
         """Whether a row is an evaluated episode (otherwise a moment of training)."""
         return "episode" in self.columns
+
+    @property
+    def settings(self) -> list[str]:
+        """Columns of settings, in the order of the file."""
+        return [name for name in self.columns if name not in {*_STANDARD, *_ADDED}]
 
 
 def read_table(path: str | Path) -> Table:
@@ -171,7 +179,7 @@ def read_episodes(path: str | Path) -> Table:
 
 
 def read_directory(directory: str | Path) -> tuple[Table | None, Table | None]:
-    """Read every ``*.csv`` of a grid's directory.
+    """Read every ``*.csv`` of a grid's directory, and what its ``grid.json`` says of them.
 
     Args:
         directory: ``experiments/results/<grid>``.
@@ -182,19 +190,21 @@ def read_directory(directory: str | Path) -> tuple[Table | None, Table | None]:
     Raises:
         TableError: If a file is not valid.
     """
+    facts = read_facts(Path(directory))
     tables = [read_table(path) for path in sorted(Path(directory).glob("*.csv"))]
     filled = [table for table in tables if len(table)]
-    curves = [table for table in filled if not table.is_episodes]
-    episodes = [table for table in filled if table.is_episodes]
-    name = str(directory)
-    return (
-        concatenate(curves, source=name) if curves else None,
-        concatenate(episodes, source=name) if episodes else None,
+    kinds = ([t for t in filled if not t.is_episodes], [t for t in filled if t.is_episodes])
+    curves, episodes = (
+        _with_ratios(replace(concatenate(kind, source=str(directory)), facts=facts))
+        if kind
+        else None
+        for kind in kinds
     )
+    return curves, episodes
 
 
 def concatenate(tables: Sequence[Table], *, source: str) -> Table:
-    """Put tables of one kind below each other; an optional column that one lacks becomes NaN.
+    """Put tables of one kind below each other; a setting that one lacks is empty.
 
     Args:
         tables: At least one table.
@@ -209,7 +219,7 @@ def concatenate(tables: Sequence[Table], *, source: str) -> Table:
         raise TableError(f"{source}: curve and episode tables cannot be joined")
     names = list(dict.fromkeys(name for table in tables for name in table.columns))
     columns = {
-        name: np.concatenate([t.columns.get(name, np.full(len(t), np.nan)) for t in tables])
+        name: np.concatenate([t.columns.get(name, np.full(len(t), "")) for t in tables])
         for name in names
     }
     return Table(columns, tuple(note for table in tables for note in table.notes), source)
@@ -217,7 +227,7 @@ def concatenate(tables: Sequence[Table], *, source: str) -> Table:
 
 def mask(table: Table, rows: np.ndarray) -> Table:
     """Return the rows where the boolean array ``rows`` [R] holds; the notes stay."""
-    return Table({k: v[rows] for k, v in table.columns.items()}, table.notes, table.source)
+    return replace(table, columns={k: v[rows] for k, v in table.columns.items()})
 
 
 def select(table: Table, **equals: object) -> Table:
@@ -242,11 +252,8 @@ def select(table: Table, **equals: object) -> Table:
 
 
 def unique(table: Table, column: str) -> list:
-    """Return the distinct values of a column, sorted, without NaN."""
-    values = table[column]
-    if values.dtype.kind == "f":
-        values = values[~np.isnan(values)]
-    return np.unique(values).tolist()
+    """Return the distinct values of a column, sorted; numbers in text by their size."""
+    return sorted(set(table[column].tolist()), key=sort_key)
 
 
 def note_texts(table: Table, key: str) -> list[str]:
@@ -267,23 +274,25 @@ def _parse_note(arm: str, line: str) -> Note:
 def _check_header(path: Path, cells: Sequence[str]) -> list[str]:
     header = [cell.strip() for cell in cells]
     required = EPISODE_COLUMNS if "episode" in header else CURVE_COLUMNS
-    known = (*required, *OPTIONAL_COLUMNS)
     for name in header:
-        if name not in known:
-            raise TableError(f"{path}:header: unknown column '{name}': {choose_one(name, known)}")
         if header.count(name) > 1:
             raise TableError(f"{path}:header: column '{name}' appears {header.count(name)} times")
     for name in required:
         if name not in header:
-            raise TableError(f"{path}:header: column '{name}' is missing, found {','.join(header)}")
+            others = [column for column in header if column not in required]
+            advice = choose_one(name, others)
+            raise TableError(f"{path}:header: column '{name}' is missing: {advice}")
+    for name in header:
+        if not name or name in _ADDED or name in _STANDARD - {*required}:
+            raise TableError(f"{path}:header: column '{name}' cannot be a setting of such a table")
     return header
 
 
 def _convert(path: Path, name: str, cells: list[str], lines: list[int]) -> np.ndarray:
+    if name not in _STANDARD:
+        return np.array([_setting(cell) for cell in cells], dtype=str)
     if name not in _COUNTS and name not in _NUMBERS:
         return _check_text(path, name, cells, lines)
-    if name in _MAY_BE_EMPTY:
-        cells = [cell or "nan" for cell in cells]
     try:
         values = np.array(cells, dtype=str).astype(np.float64)
     except ValueError:
@@ -303,6 +312,40 @@ def _number(path: Path, name: str, cell: str, line: int) -> float:
         return float(cell)
     except ValueError:
         raise TableError(f"{path}:{line}: {name} is '{cell}', expected a number") from None
+
+
+def _setting(cell: str) -> str:
+    """Return the label of a setting; numbers always written alike."""
+    try:
+        return f"{float(cell):g}"
+    except ValueError:
+        return cell
+
+
+def _with_ratios(table: Table) -> Table:
+    """Return the table with the rows of every measure that is the ratio of two others.
+
+    A ratio is not measured (no row) where its denominator is not positive.
+    """
+    kept = [c for c in table.columns if c not in ("metric", "value")]
+    keys = list(zip(*(table[c].tolist() for c in kept), strict=True))
+    metric, value = table["metric"], table["value"]
+    rows, names, values = [], [], []
+    for name, measure in table.facts.measures.items():
+        for prefix in ("", EVALUATION) if measure.ratio else ():
+            top, below = (prefix + part for part in measure.ratio)
+            under = {keys[i]: value[i] for i in np.flatnonzero(metric == below)}
+            for i in np.flatnonzero(metric == top):
+                if under.get(keys[i], 0.0) > 0:
+                    rows.append(i)
+                    names.append(prefix + name)
+                    values.append(value[i] / under[keys[i]])
+    if not rows:
+        return table
+    more = {c: v[rows] for c, v in table.columns.items()}
+    more |= {"metric": np.array(names), "value": np.array(values)}
+    joined = {c: np.concatenate([v, more[c]]) for c, v in table.columns.items()}
+    return replace(table, columns=joined)
 
 
 def _check_text(path: Path, name: str, cells: list[str], lines: list[int]) -> np.ndarray:

@@ -1,7 +1,10 @@
 """From finished runs to the committed tables: ``experiments/results/<grid>/<arm>.csv``.
 
-Per arm a curve table (main metrics, at most ``MAX_POINTS`` rows each) and an episode table,
-with comment lines that say what was reduced and which command makes the rows again.
+Per arm a curve table (what is measured of episodes, at most ``MAX_POINTS`` rows each) and an
+episode table, with comment lines that say what was reduced and which command makes the rows again.
+An axis of the grid that tells apart arms which task, shift and variant do not is a column of both,
+such as ``phi``. ``grid.json`` beside them says what the figures need to know of the grid. Tables of
+a smoke grid are no results: they stay in ``runs/smoke/``.
 """
 
 from __future__ import annotations
@@ -10,17 +13,16 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from twirl_mjx import files
-from twirl_mjx.figures.style import METRICS
+from twirl_mjx.figures.facts import EVALUATION, FILE
 from twirl_mjx.figures.tables import CURVE_COLUMNS, EPISODE_COLUMNS
+from twirl_mjx.sweep.describe import facts, text_of, write
 from twirl_mjx.sweep.grid import Grid
 from twirl_mjx.sweep.plan import Cell, is_finished
 from twirl_mjx.training.rundir import RunDir
 
 MAX_POINTS = 100
 """Most rows of one metric of one run."""
-EVALUATION = "eval/"
-SETTING_COLUMNS = {"phi": "replay.phi", "utd": "droq.utd"}
-"""Column -> config field; a table has the columns whose field varies in the grid."""
+_TAKEN = {*CURVE_COLUMNS, *EPISODE_COLUMNS, "arm", "label"}
 
 Row = dict[str, str]
 
@@ -41,11 +43,12 @@ def gather(grid: Grid, cells: Sequence[Cell], runs: Path, results: Path) -> list
         results: ``experiments/results``; the tables go into a folder of the grid in it.
 
     Returns:
-        The files written.
+        The tables written.
     """
-    folder = results / grid.results_name
+    folder = tables_folder(grid, runs, results)
     written = []
-    columns = tuple(c for c, field in SETTING_COLUMNS.items() if field in grid.varied)
+    settings = settings_of(grid)
+    columns = tuple(dict.fromkeys(c for row in settings.values() for c in row))
     arms = dict.fromkeys(cell.arm for cell in cells if cell.arm)
     for arm in arms:
         mine = [cell for cell in cells if cell.arm == arm]
@@ -53,8 +56,8 @@ def gather(grid: Grid, cells: Sequence[Cell], runs: Path, results: Path) -> list
         if not finished:
             continue
         notes = notes_of(grid, len(finished), len(mine)) + nominal_notes(finished)
-        curves = [row for cell in finished for row in curve_rows(cell, runs, columns)]
-        episodes = [row for cell in finished for row in episode_rows(cell, runs, columns)]
+        curves = [row | settings[arm] for cell in finished for row in curve_rows(cell, runs)]
+        episodes = [row | settings[arm] for cell in finished for row in episode_rows(cell, runs)]
         for suffix, header, rows in (
             ("", CURVE_COLUMNS, curves),
             (".episodes", EPISODE_COLUMNS, episodes),
@@ -62,9 +65,46 @@ def gather(grid: Grid, cells: Sequence[Cell], runs: Path, results: Path) -> list
             path = folder / f"{arm}{suffix}.csv"
             write_table(path, notes, (*header, *columns), rows)
             written.append(path)
+    if written:
+        configs = [draft.config for draft in grid.drafts]
+        orders = {c: list(dict.fromkeys(r[c] for r in settings.values() if r[c])) for c in columns}
+        tasks, shifts = (c.task for c in configs), (c.shift for c in configs)
+        shown = {**grid.shown, "smoke": grid.smoke}
+        write(folder / FILE, text_of(facts(tasks, shifts, orders, shown)))
     for path in stale_tables(folder, grid, set(arms)):
         path.unlink()
     return written
+
+
+def tables_folder(grid: Grid, runs: Path, results: Path) -> Path:
+    """Return the folder of a grid's tables; those of a smoke grid stay beside the runs."""
+    return (runs / "smoke" if grid.smoke else results) / grid.results_name
+
+
+def settings_of(grid: Grid) -> dict[str, Row]:
+    """Return arm -> column -> label, for the axes that tell apart arms of one variant.
+
+    An axis counts if two arms of the same task, shift and variant differ on it. A label is written
+    without the name of its axis in front (``tau0.01`` is 0.01), and is empty where the arm's block
+    has no such axis. An axis named like a column of the tables gets ``axis_`` in front.
+    """
+    arms = {d.arm: (dict(d.labels), (d.config.task, d.config.shift, d.config.variant))
+            for d in grid.drafts}  # fmt: skip
+    columns: dict[str, Row] = {}
+    for axis in dict.fromkeys(axis for labels, _ in arms.values() for axis in labels):
+        seen: dict[tuple[str, ...], set[str]] = {}
+        for labels, place in arms.values():
+            seen.setdefault(place, set()).add(labels.get(axis, ""))
+        if max(map(len, seen.values())) < 2:
+            continue
+        full = dict.fromkeys(labels[axis] for labels, _ in arms.values() if axis in labels)
+        short = {label: label.removeprefix(axis).lstrip(" =_") or label for label in full}
+        if len(set(short.values())) < len(short):
+            short = {label: label for label in full}
+        name = f"axis_{axis}" if axis in _TAKEN else axis
+        columns[name] = {arm: short.get(labels.get(axis, ""), "") for arm, (labels, _) in
+                         arms.items()}  # fmt: skip
+    return {arm: {name: column[arm] for name, column in columns.items()} for arm in arms}
 
 
 def notes_of(grid: Grid, finished: int, expected: int) -> list[str]:
@@ -95,43 +135,36 @@ def stale_tables(folder: Path, grid: Grid, arms: set[str]) -> list[Path]:
     return stale
 
 
-def curve_rows(cell: Cell, runs: Path, columns: Sequence[str]) -> list[Row]:
-    """Return the main metrics of a run; those of the evaluation at 0 where nothing was trained."""
+def curve_rows(cell: Cell, runs: Path) -> list[Row]:
+    """Return what a run reports of episodes while it trains; the evaluation at 0 if untrained."""
     path = RunDir(runs / cell.name).metrics
     if cell.config.variant == "zero-shot" or not path.is_file():
-        return _untrained_rows(cell, runs, columns)
+        return _untrained_rows(cell, runs)
+    measures = {row["metric"] for row in episode_rows(cell, runs)}
     series: dict[str, list[Row]] = {}
     for row in files.read_rows(path, "the metrics of a run", cells_of(CURVE_COLUMNS)):
-        name = row["metric"]
-        if name.removeprefix(EVALUATION) in METRICS:
-            series.setdefault(name, []).append(row | _settings(cell, columns))
+        if row["metric"].removeprefix(EVALUATION) in measures:
+            series.setdefault(row["metric"], []).append(row)
     return [row for rows in series.values() for row in thin(rows)]
 
 
-def _untrained_rows(cell: Cell, runs: Path, columns: Sequence[str]) -> list[Row]:
+def _untrained_rows(cell: Cell, runs: Path) -> list[Row]:
     values: dict[str, list[float]] = {}
-    rows = episode_rows(cell, runs, columns)
+    rows = episode_rows(cell, runs)
     for row in rows:
         values.setdefault(row["metric"], []).append(float(row["value"]))
     return [
-        {c: rows[0][c] for c in (*EPISODE_COLUMNS[:5], *columns)}
+        {c: rows[0][c] for c in EPISODE_COLUMNS[:5]}
         | {"metric": EVALUATION + name, "env_steps": "0", "grad_steps": "0", "wall_s": "0"}
         | {"value": f"{sum(column) / len(column):.6g}"}
         for name, column in values.items()
     ]
 
 
-def episode_rows(cell: Cell, runs: Path, columns: Sequence[str]) -> list[Row]:
-    """Return the main metrics of every episode of a run's final evaluation."""
+def episode_rows(cell: Cell, runs: Path) -> list[Row]:
+    """Return every measure of every episode of a run's final evaluation."""
     path = RunDir(runs / cell.name).episodes
-    rows = files.read_rows(path, "the evaluation of a run", cells_of(EPISODE_COLUMNS))
-    return [row | _settings(cell, columns) for row in rows if row["metric"] in METRICS]
-
-
-def _settings(cell: Cell, columns: Sequence[str]) -> Row:
-    values = {"phi": cell.config.effective_phi, "utd": cell.config.droq.utd}
-    trained = cell.config.variant != "zero-shot"
-    return {column: f"{values[column]:g}" if trained else "" for column in columns}
+    return files.read_rows(path, "the evaluation of a run", cells_of(EPISODE_COLUMNS))
 
 
 def thin(rows: Sequence[Row], points: int = MAX_POINTS) -> list[Row]:

@@ -4,7 +4,10 @@ A grid module holds ``GRID`` and ``REDUCED`` (a smaller form), each a tuple of *
 ``REDUCED_NOTE``. A block is a dict: ``preset``, ``seeds``, ``axes`` (axis -> label -> settings by
 dotted config field), and optionally ``base`` (settings of every cell) and ``nominal`` (settings of
 the run that adaptation starts from). Its cells are the product of all axes and seeds; the labels
-joined by ``-`` name the *arm*, which is a cell without its seed.
+joined by ``-`` name the *arm*, which is a cell without its seed. ``"smoke": True`` in every block
+of a form says that its runs only show that everything works: they give no results. The module may
+say how its results are shown in ``RESULTS`` (``title``, ``about``, ``place``, ``titles`` of axes,
+``baseline``), all of them optional.
 """
 
 from __future__ import annotations
@@ -23,8 +26,10 @@ from twirl_mjx.training.config import TrainConfig
 from twirl_mjx.training.config_json import settle
 from twirl_mjx.training.presets import PRESETS, make_config
 
-BLOCK_KEYS = ("preset", "seeds", "axes", "base", "nominal")
+BLOCK_KEYS = ("preset", "seeds", "axes", "base", "nominal", "smoke")
 """What a block may hold; the first three are needed."""
+RESULTS_KEYS = {"title": str, "about": str, "place": int, "titles": dict, "baseline": dict}
+"""What ``RESULTS`` may hold, and its type."""
 
 Settings = Mapping[str, Any]
 """Dotted config field -> value."""
@@ -42,6 +47,8 @@ class Draft:
     """The run, every field resolved but ``source``."""
     nominal: tuple[tuple[str, Any], ...]
     """Settings of the nominal run on top of its preset; only used under a shift."""
+    labels: tuple[tuple[str, str], ...] = ()
+    """(axis, label) of the cell on every axis of its block."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -56,10 +63,12 @@ class Grid:
     """What was reduced; empty for the full form."""
     drafts: tuple[Draft, ...]
     """Its cells, arms in order, seeds innermost."""
-    varied: frozenset[str]
-    """Dotted fields that an axis sets."""
     command: str
     """Command that runs it."""
+    smoke: bool = False
+    """Whether its runs are no results."""
+    shown: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    """``RESULTS`` of the module."""
 
     @property
     def results_name(self) -> str:
@@ -103,12 +112,24 @@ def load(name: str, *, reduced: bool = False, seeds: Sequence[int] | None = None
     for number, block in enumerate(blocks):
         drafts += expand(block, f"{path.name}: {form}[{number}]", seeds)
     check_unique(drafts, f"{path.name}: {form}")
-    varied = frozenset(
-        field for block in blocks for axis in block["axes"].values() for s in axis.values()
-        for field in s
-    )  # fmt: skip
     note = str(getattr(module, "REDUCED_NOTE", "smaller budgets")) if reduced else ""
-    return Grid(path.stem, reduced, note, tuple(drafts), varied, command)
+    smoke = {bool(block.get("smoke", False)) for block in blocks}
+    if len(smoke) > 1:
+        raise ValueError(f"{path}: {form}: some blocks are smoke, some not (nearest: all or none)")
+    shown = check_results(getattr(module, "RESULTS", {}), str(path))
+    return Grid(path.stem, reduced, note, tuple(drafts), command, smoke.pop(), shown)
+
+
+def check_results(shown: Mapping[str, Any], where: str) -> Mapping[str, Any]:
+    """Return ``RESULTS`` of a module.
+
+    Raises:
+        ValueError: An unknown key (with the nearest), or a value of another type.
+    """
+    for key, value in shown.items():
+        check_choice(f"key in {where}: RESULTS", key, tuple(RESULTS_KEYS))
+        check_type(f"{where}: RESULTS[{key!r}]", value, RESULTS_KEYS[key])
+    return shown
 
 
 def _module(path: Path) -> ModuleType:
@@ -147,13 +168,14 @@ def expand(block: Mapping[str, Any], where: str, seeds: Sequence[int] | None) ->
     nominal = tuple(sorted(block.get("nominal", {}).items()))
     drafts = []
     for choice in itertools.product(*(axis.items() for axis in block["axes"].values())):
+        labels = tuple(zip(block["axes"], (label for label, _ in choice), strict=True))
         arm = "-".join(label for label, _ in choice)
         settings = dict(block.get("base", {}))
         for _, more in choice:
             settings |= more
         for seed in chosen:
             config = configure(block["preset"], settings | {"seed": seed}, f"{where}, arm {arm}")
-            drafts.append(Draft(arm, block["preset"], config, nominal))
+            drafts.append(Draft(arm, block["preset"], config, nominal, labels))
     return drafts
 
 

@@ -84,9 +84,12 @@ class Biped(Task[BipedOptions]):
     measures = {
         "standing_time": STANDING_MEASURES["standing_time"],
         "on_feet": STANDING_MEASURES["on_feet"],
-        "min_distance": Measure("goal_distance", "min", 1.0, "m", "closest approach to the goal"),
+        "min_distance": Measure(
+            "goal_distance", "min", 1.0, "m", "closest approach to the goal", smaller_is_better=True
+        ),
         "cosine": STANDING_MEASURES["cosine"],
     }
+    lead = ("return", "standing_time", "on_feet", "success")
     chain = (
         Link("stand", {"task": "stand"}),
         Link("walk", {"task": "biped"} | WALK),

@@ -156,10 +156,16 @@ class Hurdles(Task[HurdlesOptions]):
         "clean_clearances": Measure(
             "clean_clearances", "max", 1.0, "1", "hurdles passed in a single flight phase"
         ),
-        "hit_hurdle": Measure("hit_hurdle", "max", 1.0, "share", "ended by touching a hurdle"),
-        "fall": Measure("fall", "max", 1.0, "share", "ended by the trunk touching the ground"),
+        "hit_hurdle": Measure(
+            "hit_hurdle", "max", 1.0, "share", "ended by touching a hurdle", True
+        ),
+        "fall": Measure(
+            "fall", "max", 1.0, "share", "ended by the trunk touching the ground", True
+        ),
         "distance_x": Measure("distance_x", "max", 1.0, "m", "way made along x"),
     }
+    lead = ("hurdles_passed", "single_flight", "return")
+    ratios = {"single_flight": ("clean_clearances", "hurdles_passed")}
     chain = (
         Link("imitate", {"task": "imitate"}),
         Link("hurdles", {"task": "hurdles"}),

@@ -15,7 +15,9 @@ from twirl_mjx.tasks.task import Measure, Task
 COMMON: dict[str, Measure] = {
     "return": Measure("reward", "sum", 1.0, "1", "undiscounted return"),
     "episode_length": Measure("step", "sum", 1.0, "steps", "control steps until the end"),
-    "terminated": Measure("terminated", "max", 1.0, "share", "ended by the task, not by time"),
+    "terminated": Measure(
+        "terminated", "max", 1.0, "share", "ended by the task, not by time", True
+    ),
 }
 """What is measured of every task."""
 SUCCESS = Measure("", "max", 1.0, "share", "met the task's criterion")

@@ -35,6 +35,8 @@ class Measure(NamedTuple):
     """``s``, ``m``, ``share``, ``1`` ..."""
     about: str = ""
     """What is measured, in a few words."""
+    smaller_is_better: bool = False
+    """Direction of improvement."""
 
 
 class Link(NamedTuple):
@@ -60,8 +62,11 @@ class Task[O]:
     collision: ClassVar[CollisionSet] = "legs"
     """Robot shapes the contact solver sees."""
     measures: ClassVar[Mapping[str, Measure]] = {}
-    """What is measured of an episode beside return, length and kind of end; the one that leads in
-    tables comes first."""
+    """What is measured of an episode beside return, length and kind of end."""
+    lead: ClassVar[tuple[str, ...]] = ("return",)
+    """Measures that the task is judged by in figures and tables, the main one first."""
+    ratios: ClassVar[Mapping[str, tuple[str, str]]] = {}
+    """Measures that figures and tables compute: the first over the second, where not zero."""
     source: ClassVar[str | None] = None
     """Name of the task whose trained policy is the default source."""
     chain: ClassVar[tuple[Link, ...]] = ()
