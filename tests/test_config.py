@@ -196,7 +196,7 @@ def test_names_on_the_command_line_are_those_of_the_file_and_of_grids() -> None:
             "replay.phi", "eval.episode_length"} <= names  # fmt: skip
     changed = config_json.settle(config, {"biped.distance_weight": 4.0, "num_envs": 8})
     assert (changed.options.distance_weight, changed.num_envs) == (4.0, 8)
-    with pytest.raises(ValueError, match="nearest: 'biped.distance_weight'"):
+    with pytest.raises(ValueError, match=r"nearest: 'biped\.distance_weight'"):
         config_json.settle(config, {"biped.distance_wait": 4.0})
 
 

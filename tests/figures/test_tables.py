@@ -100,7 +100,7 @@ def test_wrong_headers_are_refused(curve_file):
         tables.read_table(
             curve_file([CURVE[:4] + CURVE[5:]], [c for c in tables.CURVE_COLUMNS if c != "seed"])
         )
-    with pytest.raises(TableError, match="'env_steps' is missing: .*nearest: 'env_step'"):
+    with pytest.raises(TableError, match=r"'env_steps' is missing: .*nearest: 'env_step'"):
         columns = ["env_step" if c == "env_steps" else c for c in tables.CURVE_COLUMNS]
         tables.read_table(curve_file(columns=columns))
     with pytest.raises(TableError, match="column 'value' appears 2 times"):

@@ -12,6 +12,8 @@ from typing import Any
 from matplotlib import colormaps
 from matplotlib.colors import to_hex
 
+from twirl_mjx.checks import choose_one
+
 
 @dataclass(frozen=True)
 class Mark:

@@ -15,7 +15,7 @@ from pathlib import Path
 from twirl_mjx import files
 from twirl_mjx.figures.facts import EVALUATION, FILE
 from twirl_mjx.figures.tables import CURVE_COLUMNS, EPISODE_COLUMNS
-from twirl_mjx.sweep.describe import facts, text_of, write
+from twirl_mjx.sweep.describe import facts, text_of
 from twirl_mjx.sweep.grid import Grid
 from twirl_mjx.sweep.plan import Cell, is_finished
 from twirl_mjx.training.rundir import RunDir
@@ -70,7 +70,7 @@ def gather(grid: Grid, cells: Sequence[Cell], runs: Path, results: Path) -> list
         orders = {c: list(dict.fromkeys(r[c] for r in settings.values() if r[c])) for c in columns}
         tasks, shifts = (c.task for c in configs), (c.shift for c in configs)
         shown = {**grid.shown, "smoke": grid.smoke}
-        write(folder / FILE, text_of(facts(tasks, shifts, orders, shown)))
+        files.write_text(folder / FILE, text_of(facts(tasks, shifts, orders, shown)))
     for path in stale_tables(folder, grid, set(arms)):
         path.unlink()
     return written
