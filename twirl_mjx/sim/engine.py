@@ -131,9 +131,8 @@ def apply_dynamics(scene: Scene, command: MotorCommand, dynamics: Dynamics) -> m
     changes: dict[str, jax.Array] = {}
     for place, entry in entries(scene, PLACES, model_values(scene, command, dynamics), jnp):
         if place.index is not None:
-            parts = place.field.split(".")
-            whole = changes.get(place.field, functools.reduce(getattr, parts, scene.mjx_model))
-            entry = whole.at[place.index(scene)].set(entry)
+            whole: Any = functools.reduce(getattr, place.field.split("."), scene.mjx_model)
+            entry = changes.get(place.field, whole).at[place.index(scene)].set(entry)
         changes[place.field] = entry
     return scene.mjx_model.tree_replace(changes)
 

@@ -26,14 +26,15 @@ class Ranges:
         """
         checked: dict[str, tuple[str, float, float]] = {}
         for name, low, high in self.bounds:
-            ends = [check_leaf("range of ", name, end) for end in (low, high)]
+            low = check_leaf("range of ", name, low)
+            high = check_leaf("range of ", name, high)
             if name in checked:
-                raise ValueError(f"range of {name} is given twice: {checked[name][1:]}, {ends}")
+                raise ValueError(f"range of {name} is given twice: give it once")
             if low > high:
                 raise ValueError(
                     f"range {name}={low!r}:{high!r} is reversed (nearest: {name}={high!r}:{low!r})"
                 )
-            checked[name] = (name, *ends)
+            checked[name] = (name, low, high)
         object.__setattr__(self, "bounds", tuple(checked[name] for name in LEAF if name in checked))
 
     def __bool__(self) -> bool:
