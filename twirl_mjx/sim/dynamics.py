@@ -10,10 +10,11 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import operator
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
 
 import flax.struct
 import jax
@@ -109,9 +110,9 @@ _MASSES = (
     Place("body_mass", trunk, _added),
     Place("body_subtreemass", lambda s: np.array([0, trunk(s)]), _added),  # the world's, its own
 )
-_COM_X = Place("body_ipos", lambda s: (trunk(s), 0), _added)
-_COM_Y = Place("body_ipos", lambda s: (trunk(s), 1), _added)
-_COM_Z = Place("body_ipos", lambda s: (trunk(s), 2), _added)
+_COM_X, _COM_Y, _COM_Z = (
+    Place("body_ipos", lambda s, axis=axis: (trunk(s), axis), _added) for axis in range(3)
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -163,25 +164,31 @@ def leaf_value(dynamics: Dynamics, name: str) -> jax.Array:
     return jnp.asarray(LEAF[name].nominal, jnp.float32) if value is None else value
 
 
-def entries(
-    scene: Scene, places: Mapping[str, Sequence[Place]], values: Mapping[str, Any], xp: Any
-) -> Iterator[tuple[Place, Any]]:
-    """Return where values go in a model of a scene, and the new entries there.
+class Target(NamedTuple):
+    """A place in the models of one scene."""
 
-    Args:
-        scene: The scene, whose own model holds the nominal entries.
-        places: By the names of ``values``.
-        values: float32 arrays of jax or float64 ones of numpy, of one world.
-        xp: ``jax.numpy`` or ``numpy``.
-    """
-    for name, value in values.items():
+    name: str
+    """Name of the value that goes there."""
+    place: Place
+    field: Callable[[Any], Any]
+    """Model of C or MJX -> the field."""
+    index: Any
+    """Numpy index of the entries, ``...`` for the whole field."""
+    base: Any
+    """The scene's own entries, which are nominal."""
+
+
+def targets(
+    scene: Scene, places: Mapping[str, Sequence[Place]], names: Iterable[str]
+) -> list[Target]:
+    """Return where the values called ``names`` go in the models of a scene."""
+    found = []
+    for name in names:
         for place in places[name]:
-            base: Any = scene.mj_model
-            for part in place.field.split("."):
-                base = getattr(base, part)
-            if place.index is not None:
-                base = base[place.index(scene)]
-            yield place, place.entry(base, value, scene, xp)
+            index = ... if place.index is None else place.index(scene)
+            field = operator.attrgetter(place.field)
+            found.append(Target(name, place, field, index, field(scene.mj_model)[index]))
+    return found
 
 
 def check_leaf(what: str, name: str, value: Any, scene: SceneKind | None = None) -> float:
@@ -230,9 +237,7 @@ class Shift:
             raise ValueError(f"shift name {name!r} is not one word (nearest: {valid!r})")
         check_choice(f"shift {name!r}: scene", scene, get_args(SceneKind))
         values = {k: check_leaf(f"shift {name!r}: ", k, v, scene) for k, v in leaves.items()}
-        for field, value in (("name", name), ("scene", scene), ("about", about)):
-            object.__setattr__(self, field, value)
-        object.__setattr__(self, "values", tuple(values.items()))
+        vars(self).update(name=name, scene=scene, about=about, values=tuple(values.items()))
 
 
 SHIFTS: dict[str, Shift] = {}

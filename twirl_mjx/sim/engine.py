@@ -7,10 +7,11 @@ physics substep; observations, rewards, contacts and torques are computed from i
 from __future__ import annotations
 
 import functools
+import itertools
 import math
 import os
 import threading
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, Literal, Protocol
 
 import flax.struct
@@ -23,7 +24,7 @@ from mujoco import mjx
 
 from twirl_mjx.sim import actuation
 from twirl_mjx.sim.actuation import MOTOR_PLACES, MotorCommand
-from twirl_mjx.sim.dynamics import LEAVES, Dynamics, entries, trunk
+from twirl_mjx.sim.dynamics import LEAVES, Dynamics, Target, targets, trunk
 from twirl_mjx.sim.scene import Scene
 
 EngineName = Literal["auto", "mjx", "native"]
@@ -128,26 +129,33 @@ def model_values(scene: Scene, command: MotorCommand, dynamics: Dynamics) -> dic
 
 def apply_dynamics(scene: Scene, command: MotorCommand, dynamics: Dynamics) -> mjx.Model:
     """Return the MJX model of one world with its physical parameters written in."""
-    changes: dict[str, jax.Array] = {}
-    for place, entry in entries(scene, PLACES, model_values(scene, command, dynamics), jnp):
-        if place.index is not None:
-            whole: Any = functools.reduce(getattr, place.field.split("."), scene.mjx_model)
-            entry = changes.get(place.field, whole).at[place.index(scene)].set(entry)
+    values = model_values(scene, command, dynamics)
+    changes: dict[str, Any] = {}
+    for name, place, field, index, base in targets(scene, PLACES, values):
+        entry = place.entry(base, values[name], scene, jnp)
+        if index is not ...:
+            whole = changes.get(place.field, field(scene.mjx_model))
+            entry = whole.at[index].set(entry)
         changes[place.field] = entry
     return scene.mjx_model.tree_replace(changes)
 
 
-def write_physics(scene: Scene, model: mujoco.MjModel, values: Mapping[str, Any]) -> None:
+def write_physics(
+    scene: Scene,
+    model: mujoco.MjModel,
+    values: Mapping[str, Any],
+    places: Sequence[Target] | None = None,
+) -> None:
     """Write the physical parameters of one world into a copy of the scene's model.
 
     Args:
         scene: The scene ``model`` is a copy of.
         model: Changed in place.
         values: As ``model_values`` returns them, by numpy in float64.
+        places: Where they go, looked up when it is not given.
     """
-    for place, entry in entries(scene, PLACES, values, np):
-        field = functools.reduce(getattr, place.field.split("."), model)
-        field[... if place.index is None else place.index(scene)] = entry
+    for name, place, field, index, base in places or targets(scene, PLACES, values):
+        field(model)[index] = place.entry(base, values[name], scene, np)
 
 
 def copy_model(scene: Scene) -> mujoco.MjModel:
@@ -192,6 +200,8 @@ class NativeEngine:
         self._rollout: mujoco.rollout.Rollout | None = None
         self._models: list[mujoco.MjModel] = []
         self._layout: Layout = ()
+        self._slots: dict[str, int | slice] = {}
+        self._places: list[Target] = []
         self._written = np.zeros((0, 0))
 
     def step(
@@ -257,8 +267,11 @@ class NativeEngine:
             self._models = [self._copy() for _ in physics]
             self._written = np.full(physics.shape, np.nan)
             self._layout = layout
+            self._slots = _slots(layout)
+            self._places = targets(self._scene, PLACES, self._slots)
         for i in np.flatnonzero((self._written != physics).any(axis=1)):
-            write_physics(self._scene, self._models[i], _unpack(layout, physics[i]))
+            values = {name: physics[i, slot] for name, slot in self._slots.items()}
+            write_physics(self._scene, self._models[i], values, self._places)
         self._written = physics
         return self._models
 
@@ -269,11 +282,10 @@ class NativeEngine:
         return model
 
 
-def _unpack(layout: Layout, row: np.ndarray) -> dict[str, Any]:
-    """Return the arrays packed in ``row`` [P], scalars as such."""
-    values, start = {}, 0
-    for name, shape in layout:
-        end = start + math.prod(shape)
-        values[name] = row[start:end].reshape(shape)[()]
-        start = end
-    return values
+def _slots(layout: Layout) -> dict[str, int | slice]:
+    """Return where every array lies in a row, scalars as such."""
+    ends = itertools.accumulate(math.prod(shape) for _, shape in layout)
+    return {
+        name: slice(end - math.prod(shape), end) if shape else end - 1
+        for (name, shape), end in zip(layout, ends, strict=True)
+    }
