@@ -9,7 +9,7 @@ import pytest
 
 from twirl_mjx import cli
 from twirl_mjx.commands.curriculum import CurriculumOptions, chain_of, plan
-from twirl_mjx.sim.dynamics import SHIFTS
+from twirl_mjx.sim.dynamics import PAPER_SHIFTS
 from twirl_mjx.training import rundir
 from twirl_mjx.training.presets import make_config
 
@@ -32,7 +32,7 @@ def test_every_link_starts_from_the_one_before_and_shifts_from_the_target(
     wider = {"max_gap": 3.7} if task == "hurdles" else {}
     assert target.task == task
     assert target.options == dataclasses.replace(plain.options, **wider)
-    assert [config.shift for config in configs[own:]] == list(SHIFTS)[1:]
+    assert [config.shift for config in configs[own:]] == list(PAPER_SHIFTS)[1:]
     assert {config.source for config in configs[own:]} == {f"r/{names[own - 1]}"}
     assert all(config.total_env_steps <= 100_000 for config in configs[own:])
     assert {config.seed for config in configs} == {3}

@@ -123,10 +123,10 @@ class Registry[T]:
             raise ValueError(f"{where}{error}") from None
         name: str = accepted.name  # type: ignore[attr-defined]
         known = self._items.get(name)
-        if known is not None and known is not accepted:
-            home = self._references.get(name, "built in")
+        if known is not None and known != accepted:
+            home = self._references.get(name, "registered before")
             raise ValueError(
-                f"{where}a {self.kind} {name!r} is there already ({home})"
+                f"{where}there is another {self.kind} called {name!r} ({home})"
                 f" (nearest: {'my_' + name!r})"
             )
         self._items[name] = accepted

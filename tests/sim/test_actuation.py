@@ -95,14 +95,43 @@ def test_derating_by_hand(temperature: float, share: float) -> None:
 
 
 def test_motor_command_by_hand() -> None:
-    whole = actuation.motor_command(make_motors(), jnp.zeros(12))
+    whole = actuation.motor_command(make_motors(), jnp.zeros(12), make_dynamics())
     np.testing.assert_allclose(whole.kp, 60.0)
     np.testing.assert_allclose(whole.kd, 3.0)
     np.testing.assert_allclose(whole.torque_limit, 33.5)
-    worn = actuation.motor_command(make_motors(0.5, 80.0), jnp.zeros(12))
+    worn = actuation.motor_command(make_motors(0.5, 80.0), jnp.zeros(12), make_dynamics())
     np.testing.assert_allclose(worn.kp, 30.0)  # heat takes torque, not gains
     np.testing.assert_allclose(worn.kd, 1.5)
     np.testing.assert_allclose(worn.torque_limit, 33.5 * 0.5 * 0.7, rtol=1e-6)
+
+
+def test_scales_of_gains_and_limits_by_hand() -> None:
+    """A motor at half strength and 80 deg C (70 %), under the world's own scales."""
+    scales = make_dynamics(overrides={"motor_strength": 0.8, "kp_scale": 1.2, "kd_scale": 0.5})
+    command = actuation.motor_command(make_motors(0.5, 80.0), jnp.zeros(12), scales)
+    np.testing.assert_allclose(command.kp, 60 * 0.5 * 1.2, rtol=1e-6)
+    np.testing.assert_allclose(command.kd, 3 * 0.5 * 0.5, rtol=1e-6)
+    np.testing.assert_allclose(command.torque_limit, 33.5 * 0.5 * 0.7 * 0.8, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("latency", "late"), [(0.0, 0), (0.002, 0), (0.003, 1), (0.02, 4), (0.0349, 7), (0.05, 10)]
+)
+def test_latency_keeps_the_last_target_for_whole_substeps(latency: float, late: int) -> None:
+    """Ten substeps of 5 ms; 2 ms round to none of them, 3 ms to one."""
+    dynamics = make_dynamics().replace(latency=jnp.float32(latency))
+    command = actuation.motor_command(make_motors(), jnp.full(12, 0.1), dynamics)
+    command = actuation.delay(command, jnp.full(12, 0.3), dynamics, 0.005, 10)
+    expected = np.repeat([0.3] * late + [0.1] * (10 - late), 12).reshape(10, 12)
+    np.testing.assert_allclose(command.late_targets, expected, rtol=1e-6)
+    np.testing.assert_allclose(command.target, 0.1, rtol=1e-6)  # what holds in the end
+    torque = actuation.pd_torque(command, jnp.zeros((10, 12)), jnp.zeros((10, 12)))
+    np.testing.assert_allclose(torque, 60 * expected, rtol=1e-6)
+
+
+def test_without_latency_a_command_is_left_alone() -> None:
+    command = actuation.motor_command(make_motors(), jnp.zeros(12), make_dynamics())
+    assert actuation.delay(command, jnp.ones(12), make_dynamics(), 0.005, 10) is command
 
 
 @pytest.mark.parametrize(
@@ -117,7 +146,7 @@ def test_motor_command_by_hand() -> None:
     ],
 )
 def test_pd_torque_by_hand(strength: float, error: float, velocity: float, torque: float) -> None:
-    command = actuation.motor_command(make_motors(strength), jnp.full(12, 0.2))
+    command = actuation.motor_command(make_motors(strength), jnp.full(12, 0.2), make_dynamics())
     result = actuation.pd_torque(command, jnp.full(12, 0.2 - error), jnp.full(12, velocity))
     np.testing.assert_allclose(result, torque, rtol=1e-5)
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from twirl_mjx.sim import look
-from twirl_mjx.sim.dynamics import SHIFTS, get_shift, make_dynamics
+from twirl_mjx.sim.dynamics import PAPER_SHIFTS, get_shift, make_dynamics
 from twirl_mjx.sim.engine import world_model
 from twirl_mjx.sim.scene import Bands, build_scene, terrain_height
 
@@ -55,7 +55,7 @@ def test_paint_leaves_the_physics_alone() -> None:
 
 def test_captions_have_the_number_of_every_shift() -> None:
     legs = np.array([1.0, 0.63, 1.0, 1.0])
-    shown = {name: look.describe(name, make_dynamics(name), legs) for name in SHIFTS}
+    shown = {name: look.describe(name, make_dynamics(name), legs) for name in PAPER_SHIFTS}
     assert shown == {
         "none": "",
         "bumpy": "bumps to 5 cm",

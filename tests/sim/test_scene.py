@@ -23,8 +23,8 @@ def scenes() -> dict[str, Scene]:
 def ray_heights(built: Scene, xy: np.ndarray, incline: float, bump_height: float) -> np.ndarray:
     """Return the ground's height [K] under ``xy`` [K, 2] as C MuJoCo's rays see it."""
     model = built.mj_model.__copy__()
-    gains = np.concatenate([np.full(12, 60.0), np.full(12, 3.0), np.full(12, 33.5)])
-    write_physics(built, model, np.concatenate([[9.81, 1.0, incline, bump_height], gains]))
+    leaves = {"bumpy": {"bump_height": bump_height}, "sloped": {"incline": incline}, "flat": {}}
+    write_physics(built, model, leaves[built.kind])
     data = mujoco.MjData(model)
     data.qpos[:] = model.key("home").qpos
     data.qpos[2] = 50.0  # out of the rays' way

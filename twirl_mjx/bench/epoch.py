@@ -93,7 +93,7 @@ def _world_parts(env: VectorEnv, state: TrainState) -> dict[str, Any]:
     """Return the parts that move the worlds and store what happened."""
     shape = (env.num_envs, env.action_size)
     command = jax.jit(jax.vmap(actuation.motor_command))(
-        state.env.world.motors, state.env.data.ctrl
+        state.env.world.motors, state.env.data.ctrl, state.env.world.dynamics
     )
     result = jax.jit(env.step)(state.env, jnp.zeros(shape))
     transition = make_transition(state.env, jnp.zeros(shape), result)

@@ -11,7 +11,7 @@ import tyro
 from twirl_mjx.checks import check_choice
 from twirl_mjx.commands.console import parse, say
 from twirl_mjx.commands.options import default_preset
-from twirl_mjx.sim.dynamics import SHIFTS
+from twirl_mjx.sim.dynamics import PAPER_SHIFTS, SHIFTS
 from twirl_mjx.sweep.grid import configure
 from twirl_mjx.tasks.registry import TASKS
 from twirl_mjx.tasks.task import Link
@@ -35,7 +35,7 @@ class CurriculumOptions:
     """Seed of every run."""
     runs: Path = Path("runs")
     """Folder of all runs."""
-    shifts: tuple[str, ...] = tuple(SHIFTS)[1:]
+    shifts: tuple[str, ...] = PAPER_SHIFTS[1:]
     """Shifts to adapt to."""
 
 
@@ -79,8 +79,7 @@ def main(argv: list[str]) -> int:
     options = parse(CurriculumOptions, argv, "twirl curriculum")
     preset = options.preset or default_preset()
     check_choice("preset", preset, PRESETS)
-    for shift in options.shifts:
-        check_choice("shift", shift, tuple(SHIFTS)[1:])
+    options = dataclasses.replace(options, shifts=tuple(map(SHIFTS.admit, options.shifts)))
     links = plan(options, preset)
     for number, (name, config) in enumerate(links, 1):
         say(f"link {number} of {len(links)}: {name}")

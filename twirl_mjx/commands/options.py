@@ -18,7 +18,7 @@ from twirl_mjx.plugins import is_reference
 from twirl_mjx.tasks.registry import TASKS
 from twirl_mjx.training.config import TrainConfig
 from twirl_mjx.training.presets import default_preset, make_config
-from twirl_mjx.worlds.config import WorldConfig
+from twirl_mjx.worlds.config import NO_OVERRIDES, DynamicsOverrides, WorldConfig
 
 
 @dataclasses.dataclass(frozen=True)
@@ -89,14 +89,16 @@ def _shown(config: TrainConfig) -> TrainConfig:
 
 
 Overrides = dict[str, dict[str, Any]]
-"""Task -> option -> value, for the options that were given."""
+"""Task, ``dynamics`` or ``worlds`` -> option -> value, for the options that were given."""
 
 
 def parse_in_tasks[T](kind: type[T], argv: list[str], prog: str) -> tuple[T, Overrides]:
-    """Parse a command that also takes options of tasks, ``--biped.goal-distance 1`` say.
+    """Parse a command that also takes options of tasks and worlds.
+
+    Such as ``--biped.goal-distance 1``, ``--dynamics.friction 0.3``, ``--randomize payload=0:2``.
 
     Returns:
-        The command's own options, and those of tasks that were given.
+        The command's own options, and those others that were given.
 
     Raises:
         ValueError: A task of a user's file that cannot be loaded.
@@ -108,7 +110,10 @@ def parse_in_tasks[T](kind: type[T], argv: list[str], prog: str) -> tuple[T, Ove
     asked = {match[1] for word in argv if (match := re.match(r"--([a-z][a-z0-9_]*)\.", word))}
     if not {"-h", "--help"} & set(argv):  # a section that is not asked for costs time to build
         tasks = [name for name in tasks if name in asked]
-    fields: list[Any] = []
+    fields: list[Any] = [
+        ("dynamics", DynamicsOverrides, dataclasses.field(default=NO_OVERRIDES)),
+        ("randomize", Annotated[tuple[str, ...], _RANDOMIZE], dataclasses.field(default=())),
+    ]
     for name in tasks:
         some = _all_optional(TASKS.get(name).Options)
         fields.append((name, some, dataclasses.field(default=some())))
@@ -119,9 +124,15 @@ def parse_in_tasks[T](kind: type[T], argv: list[str], prog: str) -> tuple[T, Ove
     own = kind(**{name: getattr(found, name) for name in _field_names(kind)})
     given = {
         name: {k: v for k, v in vars(getattr(found, name)).items() if v is not None}
-        for name in tasks
+        for name in ("dynamics", *tasks)
     }
+    given["worlds"] = {"randomize": found.randomize} if found.randomize else {}
     return own, {name: values for name, values in given.items() if values}
+
+
+_RANDOMIZE = tyro.conf.arg(
+    help="Physical parameters drawn for every episode: leaf=low:high, friction=0.4:1.25."
+)
 
 
 def _field_names(kind: type) -> list[str]:
@@ -144,14 +155,19 @@ def _all_optional(kind: type) -> type:
 
 
 def with_overrides[W: WorldConfig](config: W, overrides: Mapping[str, dict[str, Any]]) -> W:
-    """Return worlds with options of their task replaced.
+    """Return worlds with options of their task, and of their dynamics, replaced.
 
     Raises:
         ValueError: Options of another task, or out of range.
     """
     for task, values in overrides.items():
-        if task != config.task:
+        if task not in (config.task, "dynamics", "worlds"):
             name = next(iter(values))
             raise ValueError(f"{task}.{name} is an option of task {task}, not of {config.task}")
     values = overrides.get(config.task, {})
-    return dataclasses.replace(config, options=dataclasses.replace(config.options, **values))
+    return dataclasses.replace(
+        config,
+        options=dataclasses.replace(config.options, **values),
+        dynamics=dataclasses.replace(config.dynamics, **overrides.get("dynamics", {})),
+        **overrides.get("worlds", {}),
+    )

@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 
 from twirl_mjx.sim import look
-from twirl_mjx.sim.dynamics import get_shift, make_dynamics
+from twirl_mjx.sim.dynamics import get_shift
 from twirl_mjx.sim.engine import world_model
 from twirl_mjx.sim.scene import Bands, build_scene
 from twirl_mjx.tasks.base import ground_at
@@ -91,7 +91,7 @@ def record_episode(
 
 def scene_model(config: WorldConfig, recording: Recording) -> mujoco.MjModel:
     """Return the model to draw an episode in: its ground, bands and colours."""
-    dynamics = make_dynamics(config.shift, config.shift_strength)
+    dynamics = config.make_dynamics()
     bands = Bands(
         recording.hurdles,
         y=float(recording.qpos[0, 1]),

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from twirl_mjx.evaluation.rollout import evaluate_policy
-from twirl_mjx.sim.dynamics import SHIFTS, SceneKind, make_dynamics, stack
+from twirl_mjx.sim.dynamics import PAPER_SHIFTS, SceneKind, get_shift, stack
 from twirl_mjx.types import SourcePolicy
 from twirl_mjx.worlds.config import WorldConfig
 from twirl_mjx.worlds.make import make_env
@@ -19,7 +19,7 @@ def scenes_of(shifts: tuple[str, ...]) -> dict[SceneKind, list[str]]:
     """Group shifts by the ground they need."""
     groups: dict[SceneKind, list[str]] = {}
     for shift in shifts:
-        groups.setdefault(SHIFTS[shift].scene, []).append(shift)
+        groups.setdefault(get_shift(shift).scene, []).append(shift)
     return groups
 
 
@@ -29,7 +29,7 @@ def evaluate_shifts(
     *,
     episodes: int,
     seed: int,
-    shifts: tuple[str, ...] = tuple(SHIFTS),
+    shifts: tuple[str, ...] = PAPER_SHIFTS,
     strength: float = 1.0,
 ) -> dict[str, dict[str, np.ndarray]]:
     """Evaluate a policy under several conditions on one course, the config's or the fixed one.
@@ -39,6 +39,7 @@ def evaluate_shifts(
 
     Args:
         config: Task and its options; its shift is ignored, and its course is fixed if ``auto``.
+            What of the dynamics it sets by hand or draws holds in all conditions.
         policy: Any policy that acts in the task's worlds.
         episodes: E, episodes per condition.
         seed: Seed of the episodes.
@@ -52,8 +53,9 @@ def evaluate_shifts(
     config = dataclasses.replace(config, course=course)
     found: dict[str, dict[str, np.ndarray]] = {}
     for kind, names in scenes_of(shifts).items():
-        env = make_env(config, num_envs=episodes * len(names), scene_kind=kind)
-        dynamics = stack([make_dynamics(name, strength) for name in names], episodes)
+        worlds = dataclasses.replace(config, shift=names[0], shift_strength=strength)
+        env = make_env(worlds, num_envs=episodes * len(names), scene_kind=kind)
+        dynamics = stack([config.make_dynamics(name, strength) for name in names], episodes)
         index = jnp.tile(jnp.arange(episodes), len(names))
         values = evaluate_policy(env, policy)(jax.random.key(seed), dynamics, index)
         for i, name in enumerate(names):

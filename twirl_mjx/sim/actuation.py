@@ -1,6 +1,6 @@
 """From a policy's action to joint torques: scaling, low-pass filter, motor model.
 
-Spec section 3 / paper section "Actions": an action in [-1, 1]^12 is an offset around the default
+Paper, section "Actions": an action in [-1, 1]^12 is an offset around the default
 pose, low-pass filtered as an absolute joint target, clipped to the joint limits and tracked by a
 PD controller inside the physics engine.
 """
@@ -10,9 +10,10 @@ from __future__ import annotations
 import flax.struct
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from twirl_mjx.sim import a1
-from twirl_mjx.sim.dynamics import Dynamics
+from twirl_mjx.sim.dynamics import Dynamics, Place
 
 BUTTER_B = (0.20657208, 0.41314417, 0.20657208)
 """Numerator of ``scipy.signal.butter(2, 0.4)``: 2nd order, 4 Hz cut-off at fs = 20 Hz."""
@@ -62,6 +63,25 @@ class MotorCommand(flax.struct.PyTreeNode):
     """[12] N m s / rad."""
     torque_limit: jax.Array
     """[12] N m."""
+    late_targets: jax.Array | None = None
+    """[S, 12] rad, PD set-point in every physics substep where targets come late."""
+
+
+MOTOR_PLACES: dict[str, tuple[Place, ...]] = {
+    "kp": (
+        Place("actuator_gainprm", lambda _: np.s_[:, 0]),
+        Place("actuator_biasprm", lambda _: np.s_[:, 1], lambda base, kp, scene, xp: -kp),
+    ),
+    "kd": (Place("actuator_biasprm", lambda _: np.s_[:, 2], lambda base, kd, scene, xp: -kd),),
+    "torque_limit": (
+        Place(
+            "actuator_forcerange",
+            None,
+            lambda base, limit, scene, xp: xp.stack([-limit, limit], axis=-1),
+        ),
+    ),
+}
+"""Where the fields of a command go in a MuJoCo model."""
 
 
 def filter_init(joint_pos: jax.Array) -> FilterState:
@@ -100,6 +120,14 @@ def filter_step(state: FilterState, target: jax.Array) -> tuple[jax.Array, Filte
     return jnp.clip(filtered, limits[:, 0], limits[:, 1]), new_state
 
 
+def whole_motors() -> MotorState:
+    """Return motors of full strength without load."""
+    return MotorState(
+        strength=jnp.ones(a1.NUM_JOINTS),
+        temperature=jnp.full(a1.NUM_JOINTS, AMBIENT_TEMPERATURE),
+    )
+
+
 def motor_init(key: jax.Array, dynamics: Dynamics) -> MotorState:
     """Draw the motors' condition for one episode.
 
@@ -124,19 +152,47 @@ def derating(temperature: jax.Array) -> jax.Array:
     return 1.0 - (1.0 - DERATED_FRACTION) * jnp.clip(excess, 0.0, 1.0)
 
 
-def motor_command(motors: MotorState, target: jax.Array) -> MotorCommand:
+def motor_command(motors: MotorState, target: jax.Array, dynamics: Dynamics) -> MotorCommand:
     """Return gains and torque limits for one control step towards ``target`` [12] rad."""
+
+    def scaled(value: float, name: str) -> jax.Array:
+        scale = getattr(dynamics, name)
+        whole = value * motors.strength
+        return whole if scale is None else whole * scale
+
     return MotorCommand(
         target=target,
-        kp=a1.KP * motors.strength,
-        kd=a1.KD * motors.strength,
-        torque_limit=a1.TORQUE_LIMIT * motors.strength * derating(motors.temperature),
+        kp=scaled(a1.KP, "kp_scale"),
+        kd=scaled(a1.KD, "kd_scale"),
+        torque_limit=scaled(a1.TORQUE_LIMIT, "motor_strength") * derating(motors.temperature),
     )
 
 
+def delay(
+    command: MotorCommand, previous: jax.Array, dynamics: Dynamics, sim_dt: float, n_substeps: int
+) -> MotorCommand:
+    """Return the command with the last target still holding for the time of ``latency``.
+
+    Args:
+        command: For one control step.
+        previous: [12] rad, target of the control step before.
+        dynamics: Scalars of one world; without latency the command is left alone.
+        sim_dt: s, physics step, to whole ones of which the latency is rounded.
+        n_substeps: S, beyond which no latency reaches.
+    """
+    if dynamics.latency is None:
+        return command
+    late = jnp.arange(n_substeps) < jnp.round(dynamics.latency / sim_dt)
+    return command.replace(late_targets=jnp.where(late[:, None], previous, command.target))
+
+
 def pd_torque(command: MotorCommand, joint_pos: jax.Array, joint_vel: jax.Array) -> jax.Array:
-    """Return the torques [..., 12] in N m the engine applies at the given joint state [..., 12]."""
-    raw = command.kp * (command.target - joint_pos) - command.kd * joint_vel
+    """Return the torques [..., 12] in N m the engine applies at the given joint state [..., 12].
+
+    Of a command with late targets, the joint states are those of its substeps [S, 12].
+    """
+    target = command.target if command.late_targets is None else command.late_targets
+    raw = command.kp * (target - joint_pos) - command.kd * joint_vel
     return jnp.clip(raw, -command.torque_limit, command.torque_limit)
 
 

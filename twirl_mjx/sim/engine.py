@@ -7,9 +7,12 @@ physics substep; observations, rewards, contacts and torques are computed from i
 from __future__ import annotations
 
 import functools
+import itertools
+import math
 import os
 import threading
-from typing import Literal, Protocol
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal, Protocol
 
 import flax.struct
 import jax
@@ -19,21 +22,25 @@ import mujoco.rollout
 import numpy as np
 from mujoco import mjx
 
-from twirl_mjx.sim import a1
-from twirl_mjx.sim.actuation import MotorCommand
-from twirl_mjx.sim.dynamics import Dynamics
+from twirl_mjx.sim import actuation
+from twirl_mjx.sim.actuation import MOTOR_PLACES, MotorCommand
+from twirl_mjx.sim.dynamics import LEAVES, Dynamics, Target, targets, trunk
 from twirl_mjx.sim.scene import Scene
 
 EngineName = Literal["auto", "mjx", "native"]
+PLACES = {leaf.name: leaf.places for leaf in LEAVES} | MOTOR_PLACES
+"""Where leaves of ``Dynamics`` and fields of ``MotorCommand`` go in a MuJoCo model."""
+Layout = tuple[tuple[str, tuple[int, ...]], ...]
+"""(name, shape in one world) of arrays packed side by side."""
 
 
 class Trace(flax.struct.PyTreeNode):
     """State after every physics substep of one control step of all worlds."""
 
     qpos: jax.Array
-    """[N, S, 19] m, quaternion wxyz, rad."""
+    """[N, S, nq] m, quaternion wxyz, rad."""
     qvel: jax.Array
-    """[N, S, 18] m/s (world), rad/s (base frame), rad/s."""
+    """[N, S, nv] m/s (world), rad/s (base frame), rad/s."""
 
 
 class Engine(Protocol):
@@ -96,38 +103,86 @@ def _mjx_world_step(
 ) -> tuple[mjx.Data, Trace]:
     model = apply_dynamics(scene, command, dynamics)
 
-    def substep(d: mjx.Data, _: None) -> tuple[mjx.Data, tuple[jax.Array, jax.Array]]:
-        d = mjx.step(model, d)
+    def substep(d: mjx.Data, late: jax.Array | None) -> tuple[mjx.Data, tuple[Any, Any]]:
+        d = mjx.step(model, d if late is None else d.replace(ctrl=late))
         return d, (d.qpos, d.qvel)
 
-    data = data.replace(ctrl=command.target)
-    data, (qpos, qvel) = jax.lax.scan(substep, data, length=scene.options.n_substeps)
-    return data, Trace(qpos=qpos, qvel=qvel)
+    data, (qpos, qvel) = jax.lax.scan(
+        substep,
+        data.replace(ctrl=command.target),
+        command.late_targets,
+        length=scene.options.n_substeps,
+    )
+    return data.replace(ctrl=command.target), Trace(qpos=qpos, qvel=qvel)
+
+
+def model_values(scene: Scene, command: MotorCommand, dynamics: Dynamics) -> dict[str, jax.Array]:
+    """Return the values that stand in the model of a scene, by their names in ``PLACES``."""
+    leaves = {
+        leaf.name: getattr(dynamics, leaf.name)
+        for leaf in LEAVES
+        if leaf.places and leaf.scene in (None, scene.kind)
+    }
+    values = leaves | {name: getattr(command, name) for name in MOTOR_PLACES}
+    return {name: value for name, value in values.items() if value is not None}
 
 
 def apply_dynamics(scene: Scene, command: MotorCommand, dynamics: Dynamics) -> mjx.Model:
     """Return the MJX model of one world with its physical parameters written in."""
-    model = scene.mjx_model
-    ground = jnp.asarray(scene.ground_geoms)
-    limit = jnp.stack([-command.torque_limit, command.torque_limit], axis=-1)
-    changes = {
-        "opt": model.opt.replace(gravity=dynamics.gravity * jnp.array([0.0, 0.0, -1.0])),
-        "geom_friction": model.geom_friction.at[ground, 0].set(dynamics.friction),
-        "actuator_gainprm": model.actuator_gainprm.at[:, 0].set(command.kp),
-        "actuator_biasprm": model.actuator_biasprm.at[:, 1]
-        .set(-command.kp)
-        .at[:, 2]
-        .set(-command.kd),
-        "actuator_forcerange": limit,
-    }
-    if scene.kind == "sloped":
-        half = -dynamics.incline / 2
-        quat = jnp.stack([jnp.cos(half), 0.0 * half, jnp.sin(half), 0.0 * half])
-        changes["geom_quat"] = model.geom_quat.at[scene.ground_geoms[1]].set(quat)
-    if scene.kind == "bumpy":
-        scale = dynamics.bump_height / scene.mj_model.hfield_size[0, 2]
-        changes["hfield_data"] = jnp.asarray(scene.bumps.ravel()) * scale
-    return model.replace(**changes)
+    values = model_values(scene, command, dynamics)
+    changes: dict[str, Any] = {}
+    for name, place, field, index, base in targets(scene, PLACES, values):
+        entry = place.entry(base, values[name], scene, jnp)
+        if index is not ...:
+            whole = changes.get(place.field, field(scene.mjx_model))
+            entry = whole.at[index].set(entry)
+        changes[place.field] = entry
+    return scene.mjx_model.tree_replace(changes)
+
+
+def write_physics(
+    scene: Scene,
+    model: mujoco.MjModel,
+    values: Mapping[str, Any],
+    places: Sequence[Target] | None = None,
+) -> None:
+    """Write the physical parameters of one world into a copy of the scene's model.
+
+    Args:
+        scene: The scene ``model`` is a copy of.
+        model: Changed in place.
+        values: As ``model_values`` returns them, by numpy in float64.
+        places: Where they go, looked up when it is not given.
+    """
+    for name, place, field, index, base in places or targets(scene, PLACES, values):
+        field(model)[index] = place.entry(base, values[name], scene, np)
+
+
+def copy_model(scene: Scene) -> mujoco.MjModel:
+    """Return a copy of the scene's model that takes any physical parameters."""
+    model, body = scene.mj_model.__copy__(), trunk(scene)
+    # Where the frames of the trunk, its inertia and its shapes coincide, C MuJoCo copies one for
+    # the other; they part when the centre of mass moves.
+    kinds = mujoco.mjtSameFrame
+    if model.body_sameframe[body] == kinds.mjSAMEFRAME_BODY:
+        model.body_sameframe[body] = kinds.mjSAMEFRAME_BODYROT
+    for frames, owners in (
+        (model.geom_sameframe, model.geom_bodyid),
+        (model.site_sameframe, model.site_bodyid),
+    ):
+        inertial = np.isin(frames, (kinds.mjSAMEFRAME_INERTIA, kinds.mjSAMEFRAME_INERTIAROT))
+        frames[inertial & (owners == body)] = kinds.mjSAMEFRAME_NONE
+    return model
+
+
+def world_model(scene: Scene, dynamics: Dynamics) -> mujoco.MjModel:
+    """Return a copy of the scene's model with one world's parameters (scalars), motors whole."""
+    whole = actuation.whole_motors()
+    command = actuation.motor_command(whole, jnp.zeros_like(whole.strength), dynamics)
+    model = copy_model(scene)
+    values = jax.device_get(model_values(scene, command, dynamics))
+    write_physics(scene, model, {k: np.asarray(v, np.float64)[()] for k, v in values.items()})
+    return model
 
 
 class NativeEngine:
@@ -144,103 +199,93 @@ class NativeEngine:
         self._lock = threading.Lock()
         self._rollout: mujoco.rollout.Rollout | None = None
         self._models: list[mujoco.MjModel] = []
+        self._layout: Layout = ()
+        self._slots: dict[str, int | slice] = {}
+        self._places: list[Target] = []
         self._written = np.zeros((0, 0))
 
     def step(
         self, data: mjx.Data, command: MotorCommand, dynamics: Dynamics
     ) -> tuple[mjx.Data, Trace]:
         """Advance all worlds; see :class:`Engine`."""
-        num_envs, n_substeps = data.qpos.shape[0], self._scene.options.n_substeps
-        ground = (dynamics.gravity, dynamics.friction, dynamics.incline, dynamics.bump_height)
-        motors = (command.kp, command.kd, command.torque_limit)
-        start = (data.qpos, data.qvel)
-        packed = jnp.concatenate([jnp.stack(ground, -1), *motors, command.target, *start], axis=-1)
+        model, options = self._scene.mj_model, self._scene.options
+        num_envs, n_substeps = data.qpos.shape[0], options.n_substeps
+        physics = model_values(self._scene, command, dynamics)
+        late = command.late_targets
+        target = command.target if late is None else late.reshape(num_envs, -1)
+        parts = [*physics.values(), target, data.qpos, data.qvel]
+        packed = jnp.concatenate([part.reshape(num_envs, -1) for part in parts], axis=-1)
         states = jax.pure_callback(
-            self._host_step,
-            jax.ShapeDtypeStruct((num_envs, n_substeps, 37), jnp.float32),
+            functools.partial(
+                self._host_step,
+                tuple((name, value.shape[1:]) for name, value in physics.items()),
+                target.shape[-1],
+            ),
+            jax.ShapeDtypeStruct((num_envs, n_substeps, model.nq + model.nv), jnp.float32),
             packed,  # in one piece: every argument of a callback costs a copy and a dispatch
             vmap_method="broadcast_all",
         )
-        trace = Trace(qpos=states[..., :19], qvel=states[..., 19:])
+        trace = Trace(qpos=states[..., : model.nq], qvel=states[..., model.nq :])
         data = data.replace(
-            qpos=states[:, -1, :19],
-            qvel=states[:, -1, 19:],
+            qpos=trace.qpos[:, -1],
+            qvel=trace.qvel[:, -1],
             ctrl=command.target,
-            time=data.time + n_substeps * self._scene.options.sim_dt,
+            time=data.time + n_substeps * options.sim_dt,
         )
         return data, trace
 
-    def _host_step(self, packed: np.ndarray) -> np.ndarray:
+    def _host_step(self, layout: Layout, target_size: int, packed: np.ndarray) -> np.ndarray:
         # Leading axes are worlds, and seeds when the caller is vmapped over them.
-        lead = np.shape(packed)[:-1]
-        columns = np.asarray(packed, np.float64).reshape(-1, 89)
-        physics, target, state = np.split(columns, [40, 52], axis=1)
+        lead, size = np.shape(packed)[:-1], np.shape(packed)[-1]
+        columns = np.asarray(packed, np.float64).reshape(-1, size)
+        model, n_substeps = self._scene.mj_model, self._scene.options.n_substeps
+        state_at = size - model.nq - model.nv
+        physics, target, state = np.split(columns, [state_at - target_size, state_at], axis=1)
         with self._lock:
-            models = self._prepare(physics)
+            models = self._prepare(layout, physics)
             start = np.concatenate([np.zeros((len(state), 1)), state], axis=1)
             assert self._rollout is not None
-            n_substeps = self._scene.options.n_substeps
-            out = np.empty((len(state), n_substeps, 38))
+            control = target.reshape(len(state), -1, model.nu)
+            out = np.empty((len(state), n_substeps, start.shape[1]))
             self._rollout.rollout(
                 models,
                 self._data,
                 start,
-                np.repeat(target[:, None], n_substeps, axis=1),
+                np.repeat(control, n_substeps // control.shape[1], axis=1),
                 skip_checks=True,  # they cost a tenth of a step of 16 worlds
                 nstep=n_substeps,
                 state=out,
             )
-        return np.asarray(out[..., 1:], np.float32).reshape(*lead, out.shape[1], 37)
+        return np.asarray(out[..., 1:], np.float32).reshape(*lead, n_substeps, -1)
 
-    def _prepare(self, physics: np.ndarray) -> list[mujoco.MjModel]:
-        """Return one model per world holding its parameters ``physics`` [N, 40]."""
+    def _prepare(self, layout: Layout, physics: np.ndarray) -> list[mujoco.MjModel]:
+        """Return one model per world holding its parameters ``physics`` [N, P]."""
         if self._rollout is None:
             self._rollout = mujoco.rollout.Rollout(nthread=self._threads)
             self._data = [mujoco.MjData(self._scene.mj_model) for _ in range(self._threads)]
-        if len(self._models) != len(physics):
-            self._models = [_copy_model(self._scene.mj_model) for _ in physics]
+        if len(self._models) != len(physics) or self._layout != layout:
+            self._models = [self._copy() for _ in physics]
             self._written = np.full(physics.shape, np.nan)
+            self._layout = layout
+            self._slots = _slots(layout)
+            self._places = targets(self._scene, PLACES, self._slots)
         for i in np.flatnonzero((self._written != physics).any(axis=1)):
-            write_physics(self._scene, self._models[i], physics[i])
+            values = {name: physics[i, slot] for name, slot in self._slots.items()}
+            write_physics(self._scene, self._models[i], values, self._places)
         self._written = physics
         return self._models
 
-
-def _copy_model(model: mujoco.MjModel) -> mujoco.MjModel:
-    copy = model.__copy__()
-    # A diverging world must show its NaN to the guards instead of silently restarting.
-    copy.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
-    return copy
-
-
-def world_model(scene: Scene, dynamics: Dynamics) -> mujoco.MjModel:
-    """Return a copy of the scene's model with one world's parameters (scalars), motors whole."""
-    ground = (dynamics.gravity, dynamics.friction, dynamics.incline, dynamics.bump_height)
-    motors = np.repeat([a1.KP, a1.KD, a1.TORQUE_LIMIT], a1.NUM_JOINTS)
-    model = scene.mj_model.__copy__()
-    write_physics(scene, model, np.concatenate([np.array([float(x) for x in ground]), motors]))
-    return model
+    def _copy(self) -> mujoco.MjModel:
+        model = copy_model(self._scene)
+        # A diverging world must show its NaN to the guards instead of silently restarting.
+        model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
+        return model
 
 
-def write_physics(scene: Scene, model: mujoco.MjModel, values: np.ndarray) -> None:
-    """Write the physical parameters of one world into a copy of the scene's model.
-
-    Args:
-        scene: The scene ``model`` is a copy of.
-        model: Changed in place.
-        values: [40] gravity (m/s^2), friction, incline (rad), bump height (m), then kp, kd and
-            torque limit [12] each, as in ``MotorCommand``.
-    """
-    gravity, friction, incline, bump_height = values[:4]
-    kp, kd, limit = values[4:].reshape(3, 12)
-    model.opt.gravity[2] = -gravity
-    model.geom_friction[list(scene.ground_geoms), 0] = friction
-    model.actuator_gainprm[:, 0] = kp
-    model.actuator_biasprm[:, 1] = -kp
-    model.actuator_biasprm[:, 2] = -kd
-    model.actuator_forcerange[:] = np.stack([-limit, limit], axis=-1)
-    if scene.kind == "sloped":
-        half = -incline / 2
-        model.geom_quat[scene.ground_geoms[1]] = [np.cos(half), 0.0, np.sin(half), 0.0]
-    if scene.kind == "bumpy":
-        model.hfield_data[:] = scene.bumps.ravel() * (bump_height / model.hfield_size[0, 2])
+def _slots(layout: Layout) -> dict[str, int | slice]:
+    """Return where every array lies in a row, scalars as such."""
+    ends = itertools.accumulate(math.prod(shape) for _, shape in layout)
+    return {
+        name: slice(end - math.prod(shape), end) if shape else end - 1
+        for (name, shape), end in zip(layout, ends, strict=True)
+    }

@@ -13,7 +13,15 @@ import mujoco
 import numpy as np
 
 from twirl_mjx.sim import a1
-from twirl_mjx.sim.dynamics import NOMINAL_VALUES, SHIFTS, Dynamics, SceneKind
+from twirl_mjx.sim.dynamics import (
+    LEAVES,
+    NOMINAL_VALUES,
+    PAPER_SHIFTS,
+    Dynamics,
+    SceneKind,
+    get_shift,
+    leaf_value,
+)
 
 LOW, HIGH = np.array([0.36, 0.27, 0.20]), np.array([0.97, 0.91, 0.76])
 """Colours of the lowest and the highest point of the heightfield."""
@@ -116,18 +124,25 @@ PAINTED = (("icy", "friction"), ("gravity", "gravity"))
 
 def _progress(dynamics: Dynamics, shift: str, leaf: str) -> float:
     """Return how far a leaf is from nominal (0) towards the value of a shift (1), in [0, 1]."""
-    nominal, shifted = NOMINAL_VALUES[leaf], dict(SHIFTS[shift].values)[leaf]
+    nominal, shifted = NOMINAL_VALUES[leaf], dict(get_shift(shift).values)[leaf]
     return float(np.clip((getattr(dynamics, leaf) - nominal) / (shifted - nominal), 0.0, 1.0))
 
 
 def describe(shift: str, dynamics: Dynamics, leg_strength: np.ndarray) -> str:
-    """Return the shift of an episode with its number, for a caption; empty without a shift."""
+    """Return the conditions of an episode with their numbers, for a caption; empty if nominal."""
     weakest = int(np.argmin(leg_strength))
-    return {
+    shown = {
         "none": "",
         "bumpy": f"bumps to {100 * float(dynamics.bump_height):.0f} cm",
         "icy": f"friction {float(dynamics.friction):.2g}",
         "weakened": f"{a1.LEGS[weakest]} leg at {100 * float(leg_strength[weakest]):.0f} %",
         "sloped": f"hill of {math.degrees(float(dynamics.incline)):.2g} deg",
         "gravity": f"gravity {float(dynamics.gravity):.2g} m/s^2",
-    }[shift]
+    }.get(shift, shift)
+    told = {name for name, _ in get_shift(shift).values} if shift in PAPER_SHIFTS else set()
+    others = [
+        f"{leaf.name} {float(leaf_value(dynamics, leaf.name)):.3g}{leaf.unit.replace('1', '')}"
+        for leaf in LEAVES
+        if leaf.name not in told and float(leaf_value(dynamics, leaf.name)) != leaf.nominal
+    ]
+    return ", ".join(filter(None, [shown, *others]))

@@ -18,7 +18,7 @@ from typing import Any
 from twirl_mjx import files
 from twirl_mjx.figures.facts import DOES_NOTHING, FILE
 from twirl_mjx.figures.tables import read_directory, sort_key
-from twirl_mjx.sim.dynamics import SHIFTS
+from twirl_mjx.sim.dynamics import shift_names
 from twirl_mjx.tasks.measures import SUCCESS, measures_of
 from twirl_mjx.tasks.registry import TASKS
 from twirl_mjx.training.config import VARIANTS
@@ -61,7 +61,7 @@ def facts(
     """
     orders = {
         "task": in_order(tasks, TASKS.names()),
-        "shift": in_order(shifts, tuple(SHIFTS)),
+        "shift": in_order(shifts, shift_names()),
         "variant": list(VARIANT_ORDER),
         **settings,
     }

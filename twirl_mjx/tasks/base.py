@@ -40,7 +40,7 @@ class World(flax.struct.PyTreeNode):
     motors: MotorState
     """Condition of the motors."""
     dynamics: Dynamics
-    """Physical parameters, constant over episodes."""
+    """Physical parameters, constant within an episode."""
     goal: jax.Array
     """[2] m, world frame."""
     memory: Any

@@ -56,21 +56,21 @@ STANDING_TOLERANCE = 0.005
 
 LAYOUT: tuple[Entry, ...] = (
     *(
-        Entry(f"{name}[{i - HISTORY + 1}]", size, unit)
+        Entry(f"{name}[{i - HISTORY + 1}]", size, unit, noise)
         for i in range(HISTORY)
-        for name, size, unit in (
-            ("base_quat_h", 4, "1"),
-            ("joint_pos", 12, "rad"),
-            ("previous_action", 12, "1"),
+        for name, size, unit, noise in (
+            ("base_quat_h", 4, "1", 0.005),  # half an angle of 0.01 rad
+            ("joint_pos", 12, "rad", 0.005),
+            ("previous_action", 12, "1", 0.0),
         )
     ),
     *(
-        Entry(f"target_{name}[+{step}]", size, unit)
+        Entry(f"target_{name}[+{step}]", size, unit, noise)
         for step in TARGET_STEPS
-        for name, size, unit in (
-            ("base_displacement_h", 3, "m"),
-            ("base_quat_h", 4, "1"),
-            ("joint_pos", 12, "rad"),
+        for name, size, unit, noise in (
+            ("base_displacement_h", 3, "m", 0.01),
+            ("base_quat_h", 4, "1", 0.005),
+            ("joint_pos", 12, "rad", 0.0),  # the reference's own
         )
     ),
 )

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple, Protocol
 import flax.struct
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from twirl_mjx.sim import frames
 
@@ -25,28 +26,30 @@ class Entry(NamedTuple):
     name: str
     size: int
     unit: str
+    noise: float = 0.0
+    """Standard deviation of the sensors' noise at ``Dynamics.obs_noise`` 1."""
 
 
 FRAME: tuple[Entry, ...] = (
-    Entry("roll_pitch", 2, "rad"),
-    Entry("roll_pitch_rate_b", 2, "rad/s"),
-    Entry("joint_pos", 12, "rad"),
-    Entry("base_displacement_w", 3, "m"),
+    Entry("roll_pitch", 2, "rad", 0.01),
+    Entry("roll_pitch_rate_b", 2, "rad/s", 0.05),
+    Entry("joint_pos", 12, "rad", 0.005),
+    Entry("base_displacement_w", 3, "m", 0.01),
     Entry("previous_action", 12, "1"),
 )
 """One step of the proprioceptive history (paper appendix; README, decisions 1 and 2)."""
 FRAME_SIZE = sum(e.size for e in FRAME)
 
 PROPRIOCEPTIVE: tuple[Entry, ...] = (
-    Entry("goal_displacement_w", 2, "m"),
-    *(Entry(f"{e.name}[{i - HISTORY + 1}]", e.size, e.unit) for i in range(HISTORY) for e in FRAME),
+    Entry("goal_displacement_w", 2, "m", 0.02),
+    *(e._replace(name=f"{e.name}[{i - HISTORY + 1}]") for i in range(HISTORY) for e in FRAME),
 )
 """Layout of the hurdles observation, 95 numbers."""
 
 UPRIGHT: tuple[Entry, ...] = (
     *PROPRIOCEPTIVE,
-    Entry("base_x_axis_w", 3, "1"),
-    Entry("base_z_axis_w", 3, "1"),
+    Entry("base_x_axis_w", 3, "1", 0.01),
+    Entry("base_z_axis_w", 3, "1", 0.01),
 )
 """Layout of the stand and biped observation, 101 numbers."""
 
@@ -63,6 +66,11 @@ def layout_slices(layout: tuple[Entry, ...]) -> dict[str, slice]:
 def layout_size(layout: tuple[Entry, ...]) -> int:
     """Return the length of the observation."""
     return sum(entry.size for entry in layout)
+
+
+def layout_noise(layout: tuple[Entry, ...]) -> np.ndarray:
+    """Return the standard deviation [O] of the noise on every number of the observation."""
+    return np.repeat([e.noise for e in layout], [e.size for e in layout]).astype(np.float32)
 
 
 class Observer(Protocol):

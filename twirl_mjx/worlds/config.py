@@ -4,15 +4,37 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
+
+import tyro
 
 from twirl_mjx.checks import check_choice, check_range
-from twirl_mjx.sim.dynamics import get_shift
+from twirl_mjx.sim.dynamics import LEAVES, SHIFTS, Dynamics, make_dynamics
+from twirl_mjx.sim.ranges import Ranges, parse_ranges
 from twirl_mjx.tasks.registry import TASKS
 from twirl_mjx.tasks.task import Task
 
-REGISTRIES = (TASKS,)
+REGISTRIES = (TASKS, SHIFTS)
 """What a config may name that can come from a user's own file."""
+
+DynamicsOverrides: Any = dataclasses.make_dataclass(
+    "DynamicsOverrides",
+    [
+        (
+            leaf.name,
+            Annotated[
+                float | None,
+                tyro.conf.arg(help=f"{leaf.about} ({leaf.unit}; {leaf.low} to {leaf.high})"),
+            ],
+            dataclasses.field(default=None),
+        )
+        for leaf in LEAVES
+    ],
+    frozen=True,
+    namespace={"__doc__": "Physical parameters set by hand, after the shift."},
+)
+"""One optional value per leaf of ``Dynamics``."""
+NO_OVERRIDES = DynamicsOverrides()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -27,6 +49,10 @@ class WorldConfig:
     """Dynamics shift, by name, or file.py:NAME of your own."""
     shift_strength: float = 1.0
     """0 is nominal, 1 the paper's value."""
+    dynamics: DynamicsOverrides = NO_OVERRIDES
+    """Physical parameters set by hand, after the shift."""
+    randomize: tuple[str, ...] = ()
+    """Physical parameters drawn for every world and episode: leaf=low:high, friction=0.4:1.25."""
     course: Literal["auto", "random", "fixed"] = "auto"
     """Goals and hurdles; auto is random without a shift, fixed under one (README, deviations)."""
     num_envs: int = 16
@@ -48,8 +74,11 @@ class WorldConfig:
             for registry in REGISTRIES:
                 registry.admit_if_fits(reference)
         self._set("task", TASKS.admit(self.task))
-        get_shift(self.shift)
+        self._set("shift", SHIFTS.admit(self.shift))
         self._set("uses", self._references())
+        self.make_dynamics()
+        self.ranges.check_scene(SHIFTS.get(self.shift).scene)
+        self._set("randomize", self.ranges.texts())
         if self.options is None:
             self._set("options", self.task_type.Options())
         self.task_type.check_options(self.options)
@@ -63,13 +92,35 @@ class WorldConfig:
         object.__setattr__(self, name, value)
 
     def _references(self) -> tuple[str, ...]:
-        found = [TASKS.reference(self.task)]
+        found = [TASKS.reference(self.task), SHIFTS.reference(self.shift)]
         return tuple(sorted({*self.uses, *(f for f in found if f)}))
 
     @property
     def task_type(self) -> type[Task]:
         """The class of the task."""
         return TASKS.get(self.task)
+
+    @property
+    def ranges(self) -> Ranges:
+        """What is drawn for every world and episode."""
+        return parse_ranges(self.randomize)
+
+    def make_dynamics(self, shift: str | None = None, strength: float | None = None) -> Dynamics:
+        """Return the physical parameters (scalars), those set by hand last.
+
+        Args:
+            shift: Another shift than the config's.
+            strength: Another strength than the config's.
+
+        Raises:
+            ValueError: An unknown name, or a value that is out of range or without effect.
+        """
+        given = {name: value for name, value in vars(self.dynamics).items() if value is not None}
+        return make_dynamics(
+            self.shift if shift is None else shift,
+            self.shift_strength if strength is None else strength,
+            given,
+        )
 
     @property
     def fixed_course(self) -> bool:

@@ -7,13 +7,13 @@ from collections.abc import Mapping
 from typing import Any
 
 from twirl_mjx import records
-from twirl_mjx.sim.dynamics import SceneKind, get_shift, make_dynamics
+from twirl_mjx.sim.dynamics import SceneKind, get_shift
 from twirl_mjx.sim.engine import make_engine
 from twirl_mjx.sim.scene import SimOptions, build_scene
 from twirl_mjx.tasks.registry import TASKS
 from twirl_mjx.tasks.task import Task
 from twirl_mjx.worlds.check import check_task
-from twirl_mjx.worlds.config import WorldConfig, world_fields
+from twirl_mjx.worlds.config import DynamicsOverrides, WorldConfig, world_fields
 from twirl_mjx.worlds.vector import VectorEnv
 
 
@@ -54,8 +54,9 @@ def _bind(
         make_engine(config.engine, scene, threads),
         num_envs=num_envs or config.num_envs,
         episode_length=config.episode_length,
-        dynamics=make_dynamics(config.shift, config.shift_strength),
+        dynamics=config.make_dynamics(),
         metric_names=check_task(task, scene),
+        ranges=config.ranges,
     )
 
 
@@ -78,7 +79,7 @@ def make(
         options: Options of the task: an object of its ``Options``, or names and values.
         config: Everything that is not given here; without it the defaults, no shift and 256 worlds.
         **settings: Any other field of ``WorldConfig`` (``course``, ``episode_length``, ``engine``,
-            ``shift_strength``, ...).
+            ``shift_strength``, ``dynamics={"friction": 0.3}``, ``randomize=["payload=0:2"]``).
 
     Raises:
         ValueError: An unknown name or a value out of range, with the nearest valid choice.
@@ -98,6 +99,10 @@ def make(
     for key, value in (("shift", shift), ("num_envs", num_envs)):
         if value is not None:
             settings[key] = value
+    if isinstance(given := settings.get("dynamics"), Mapping):
+        settings["dynamics"] = records.from_dict(DynamicsOverrides, dict(given), "dynamics")
+    if "randomize" in settings:
+        settings["randomize"] = tuple(settings["randomize"])
     known = tuple(field.name for field in dataclasses.fields(WorldConfig))
     for key in settings:
         records.check_choice("option of make", key, known)

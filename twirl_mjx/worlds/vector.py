@@ -11,16 +11,21 @@ import mujoco
 from mujoco import mjx
 
 from twirl_mjx.sim import actuation
-from twirl_mjx.sim.dynamics import Dynamics, broadcast
+from twirl_mjx.sim.dynamics import Dynamics, broadcast, leaf_value
 from twirl_mjx.sim.engine import Engine, Trace, make_data, world_model
+from twirl_mjx.sim.ranges import NO_RANGES, Ranges, draw
 from twirl_mjx.sim.scene import CONTROL_DT, Scene
 from twirl_mjx.tasks.base import Outcome, World, make_view
-from twirl_mjx.tasks.observations import layout_size
+from twirl_mjx.tasks.observations import layout_noise, layout_size
 from twirl_mjx.tasks.task import Task
 from twirl_mjx.types import Metrics, Transition
 
 MAX_STATE = 1e4
 """A world whose position or velocity exceeds this (SI units) counts as diverged."""
+
+DRAW, NOISE, PUSH = 1001, 1002, 1003
+"""What is folded into a world's key for draws that only some worlds make: the others' numbers do
+not depend on them. Beyond the numbers of the keys that a split gives."""
 
 PHYSICS_STATE = ("time", "qpos", "qvel", "ctrl", "qacc_warmstart")
 """Fields of ``mjx.Data`` that the next step depends on; it computes the others anew."""
@@ -71,6 +76,7 @@ class VectorEnv:
         episode_length: int,
         dynamics: Dynamics,
         metric_names: tuple[str, ...],
+        ranges: Ranges = NO_RANGES,
     ) -> None:
         """Bind a task to a scene.
 
@@ -82,7 +88,12 @@ class VectorEnv:
             episode_length: Control steps before truncation.
             dynamics: Default physical parameters of the worlds, leaves () or [N].
             metric_names: Names of the metrics that the task reports (``check.check_task``).
+            ranges: Parameters that are drawn instead, for every world and episode.
+
+        Raises:
+            ValueError: A range does nothing in this scene, or a leaf has a wrong shape.
         """
+        ranges.check_scene(scene.kind)
         self.task = task
         self.metric_names = metric_names
         self.scene = scene
@@ -90,6 +101,7 @@ class VectorEnv:
         self.num_envs = num_envs
         self.episode_length = episode_length
         self.dynamics = broadcast(dynamics, num_envs)
+        self.ranges = ranges
 
     @property
     def observation_size(self) -> int:
@@ -161,8 +173,9 @@ class VectorEnv:
             raise ValueError(f"action has shape {jnp.shape(action)}, need ({self.num_envs}, 12)")
         finite_action = jnp.all(jnp.isfinite(action), axis=-1)
         action = jnp.clip(jnp.nan_to_num(action.astype(jnp.float32)), -1.0, 1.0)
-        world, command = jax.vmap(_command)(state.world, action)
-        data, trace = self.engine.step(state.data, command, world.dynamics)
+        world, command = jax.vmap(self._command)(state.world, state.data.ctrl, action)
+        pushed = state.data.replace(qvel=jax.vmap(_push)(world, state.data.qvel))
+        data, trace = self.engine.step(pushed, command, world.dynamics)
         world, next_obs, outcome, finite = jax.vmap(self._judge_world)(world, command, trace)
         invalid = ~(finite & finite_action)
         ended = EnvState(
@@ -189,6 +202,8 @@ class VectorEnv:
         self, key: jax.Array, dynamics: Dynamics
     ) -> tuple[jax.Array, jax.Array, World, jax.Array]:
         key, start_key, motor_key = jax.random.split(key, 3)
+        if self.ranges:
+            dynamics = draw(jax.random.fold_in(key, DRAW), dynamics, self.ranges)
         start = self.task.start(start_key, self.scene, dynamics)
         world = World(
             key=key,
@@ -202,7 +217,27 @@ class VectorEnv:
             task=start.task,
         )
         obs = self.task.observer.observe(start.memory, start.goal, start.qpos, start.qvel)
-        return start.qpos, start.qvel, world, obs
+        return start.qpos, start.qvel, world, self._sense(world, obs)
+
+    def _command(
+        self, world: World, previous: jax.Array, action: jax.Array
+    ) -> tuple[World, actuation.MotorCommand]:
+        """Turn an action into the motors' command; ``previous`` [12] is the last target in rad."""
+        desired = actuation.action_to_target(action)
+        target, filter_state = actuation.filter_step(world.filter, desired)
+        command = actuation.motor_command(world.motors, target, world.dynamics)
+        options = self.scene.options
+        command = actuation.delay(
+            command, previous, world.dynamics, options.sim_dt, options.n_substeps
+        )
+        return world.replace(filter=filter_state, action=action), command
+
+    def _sense(self, world: World, obs: jax.Array) -> jax.Array:
+        """Return the observation [O] with the sensors' noise of this instant."""
+        if world.dynamics.obs_noise is None:
+            return obs
+        deviation = world.dynamics.obs_noise * layout_noise(self.task.observer.layout)
+        return obs + deviation * jax.random.normal(_key_now(world, NOISE), obs.shape)
 
     def _judge_world(
         self, world: World, command: actuation.MotorCommand, trace: Trace
@@ -224,7 +259,7 @@ class VectorEnv:
             & jnp.all(jnp.isfinite(obs))
             & jnp.isfinite(outcome.reward)
         )
-        return world, obs, outcome, finite
+        return world, self._sense(world, obs), outcome, finite
 
     def _restart(self, done: jax.Array, live: Live) -> Live:
         """Start new episodes in the worlds whose episode ended; leave the others untouched."""
@@ -235,10 +270,22 @@ class VectorEnv:
         return _select(done, (fresh, fresh_world, fresh_obs), live)
 
 
-def _command(world: World, action: jax.Array) -> tuple[World, actuation.MotorCommand]:
-    target, filter_state = actuation.filter_step(world.filter, actuation.action_to_target(action))
-    command = actuation.motor_command(world.motors, target)
-    return world.replace(filter=filter_state, action=action), command
+def _key_now(world: World, stream: int) -> jax.Array:
+    """Return the key of a stream of draws in this control step of the episode."""
+    return jax.random.fold_in(jax.random.fold_in(world.key, stream), world.episode_step)
+
+
+def _push(world: World, qvel: jax.Array) -> jax.Array:
+    """Return ``qvel`` with the push that is due, every ``push_interval`` of the episode."""
+    if world.dynamics.push is None:
+        return qvel
+    interval = leaf_value(world.dynamics, "push_interval") / CONTROL_DT
+    steps = jnp.maximum(jnp.round(interval), 1.0).astype(jnp.int32)
+    due = (world.episode_step > 0) & (world.episode_step % steps == 0)
+    # direction = U(0, 2 pi)
+    angle = jax.random.uniform(_key_now(world, PUSH), maxval=2 * jnp.pi)
+    impulse = world.dynamics.push * jnp.stack([jnp.cos(angle), jnp.sin(angle)])
+    return qvel.at[:2].add(jnp.where(due, impulse, 0.0))
 
 
 def _select[T](mask: jax.Array, new: T, old: T) -> T:
