@@ -19,7 +19,6 @@ import mujoco.rollout
 import numpy as np
 from mujoco import mjx
 
-from twirl_mjx.sim import a1
 from twirl_mjx.sim.actuation import MotorCommand
 from twirl_mjx.sim.dynamics import Dynamics
 from twirl_mjx.sim.scene import Scene
@@ -216,7 +215,7 @@ def _copy_model(model: mujoco.MjModel) -> mujoco.MjModel:
 def world_model(scene: Scene, dynamics: Dynamics) -> mujoco.MjModel:
     """Return a copy of the scene's model with one world's parameters (scalars), motors whole."""
     ground = (dynamics.gravity, dynamics.friction, dynamics.incline, dynamics.bump_height)
-    motors = np.repeat([a1.KP, a1.KD, a1.TORQUE_LIMIT], a1.NUM_JOINTS)
+    motors = np.concatenate([scene.robot.kp, scene.robot.kd, scene.robot.torque_limit])
     model = scene.mj_model.__copy__()
     write_physics(scene, model, np.concatenate([np.array([float(x) for x in ground]), motors]))
     return model

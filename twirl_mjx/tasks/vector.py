@@ -13,7 +13,8 @@ from mujoco import mjx
 from twirl_mjx.sim import actuation
 from twirl_mjx.sim.dynamics import Dynamics, broadcast
 from twirl_mjx.sim.engine import Engine, Trace, make_data, world_model
-from twirl_mjx.sim.scene import CONTROL_DT, Scene
+from twirl_mjx.sim.robot import Robot
+from twirl_mjx.sim.scene import Scene
 from twirl_mjx.tasks.base import Outcome, Task, World, make_view
 from twirl_mjx.tasks.observations import layout_size
 from twirl_mjx.types import Metrics, Transition
@@ -95,12 +96,12 @@ class VectorEnv:
     @property
     def action_size(self) -> int:
         """A, one action per joint."""
-        return 12
+        return self.scene.robot.num_joints
 
     @property
     def control_dt(self) -> float:
         """Control step in s."""
-        return CONTROL_DT
+        return self.scene.robot.control_dt
 
     @functools.cached_property
     def mj_model(self) -> mujoco.MjModel:
@@ -148,16 +149,17 @@ class VectorEnv:
 
         Args:
             state: The present state.
-            action: [N, 12], clipped to [-1, 1].
+            action: [N, A], clipped to [-1, 1].
 
         Raises:
             ValueError: ``action`` has another shape.
         """
-        if jnp.shape(action) != (self.num_envs, 12):
-            raise ValueError(f"action has shape {jnp.shape(action)}, need ({self.num_envs}, 12)")
+        need = (self.num_envs, self.action_size)
+        if jnp.shape(action) != need:
+            raise ValueError(f"action has shape {jnp.shape(action)}, need {need}")
         finite_action = jnp.all(jnp.isfinite(action), axis=-1)
         action = jnp.clip(jnp.nan_to_num(action.astype(jnp.float32)), -1.0, 1.0)
-        world, command = jax.vmap(_command)(state.world, action)
+        world, command = jax.vmap(functools.partial(_command, self.scene.robot))(state.world, action)
         data, trace = self.engine.step(state.data, command, world.dynamics)
         world, next_obs, outcome, finite = jax.vmap(self._judge_world)(world, command, trace)
         invalid = ~(finite & finite_action)
@@ -189,7 +191,7 @@ class VectorEnv:
         world = World(
             key=key,
             episode_step=jnp.zeros((), jnp.int32),
-            action=jnp.zeros(12),
+            action=jnp.zeros(self.action_size),
             filter=actuation.filter_init(start.qpos[7:]),
             motors=actuation.motor_init(motor_key, dynamics),
             dynamics=dynamics,
@@ -208,7 +210,7 @@ class VectorEnv:
         memory = self.task.observer.push(world.memory, view.qpos, view.qvel, world.action)
         world = world.replace(
             memory=memory,
-            motors=actuation.motor_heat(world.motors, world.dynamics, torque, CONTROL_DT),
+            motors=actuation.motor_heat(world.motors, world.dynamics, torque, self.control_dt),
             episode_step=world.episode_step + 1,
         )
         outcome = self.task.judge(world, view, self.scene)
@@ -231,9 +233,12 @@ class VectorEnv:
         return _select(done, (fresh, fresh_world, fresh_obs), live)
 
 
-def _command(world: World, action: jax.Array) -> tuple[World, actuation.MotorCommand]:
-    target, filter_state = actuation.filter_step(world.filter, actuation.action_to_target(action))
-    command = actuation.motor_command(world.motors, target)
+def _command(
+    robot: Robot, world: World, action: jax.Array
+) -> tuple[World, actuation.MotorCommand]:
+    wanted = actuation.action_to_target(robot, action)
+    target, filter_state = actuation.filter_step(robot, world.filter, wanted)
+    command = actuation.motor_command(robot, world.motors, target)
     return world.replace(filter=filter_state, action=action), command
 
 
