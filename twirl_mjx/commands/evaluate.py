@@ -21,7 +21,8 @@ from twirl_mjx.config import SHIFTS, TrainConfig
 from twirl_mjx.evaluation.shifts import evaluate_shifts
 from twirl_mjx.figures.statistics import bootstrap
 from twirl_mjx.policies.resolve import ResolvedPolicy, resolve_policy
-from twirl_mjx.tasks.bands import MIN_GAP
+from twirl_mjx.sim.robots import A1
+from twirl_mjx.tasks.bands import min_gap
 from twirl_mjx.training.loop import EVAL_COLUMNS
 
 MEDIANS = ("min_distance",)
@@ -159,7 +160,7 @@ def on_course(config: TrainConfig, options: EvaluateOptions) -> TrainConfig:
             biped, fixed_goal=(goal, 0.0), goal_min_radius=goal, goal_max_radius=goal
         )
     if (gap := options.hurdle_gap) is not None:
-        check_range("hurdle_gap", gap, MIN_GAP, 100.0)
+        check_range("hurdle_gap", gap, min_gap(A1), 100.0)
         hurdles = dataclasses.replace(hurdles, fixed_gap=gap, min_gap=gap, max_gap=gap)
     if (gaps := options.hurdle_gaps) is not None:
         if options.course != "random" or options.hurdle_gap is not None:

@@ -104,7 +104,6 @@ def captions(config: TrainConfig, recording: Recording) -> list[list[str]]:
     """Return the text lines of every frame."""
     from twirl_mjx.sim import look
     from twirl_mjx.sim.dynamics import make_dynamics
-    from twirl_mjx.sim.scene import CONTROL_DT
 
     shown = {
         "stand": ("cosine",),
@@ -113,13 +112,13 @@ def captions(config: TrainConfig, recording: Recording) -> list[list[str]]:
         "hurdles": ("hurdles_passed",),
     }[config.task]
     total = np.cumsum(recording.reward)
-    shift = look.describe(
-        config.shift, make_dynamics(config.shift, config.shift_strength), recording.leg_strength
-    )
+    dynamics = make_dynamics(config.shift, config.shift_strength)
+    shift = look.describe(config.shift, recording.robot, dynamics, recording.leg_strength)
+    control_dt = recording.robot.control_dt
     title = f"{config.task}, {shift}" if shift else config.task
     return [
         [
-            f"{title}  {CONTROL_DT * (t + 1):5.2f} s",
+            f"{title}  {control_dt * (t + 1):5.2f} s",
             f"return {total[t]:.0f}  "
             + "  ".join(f"{k} {recording.metrics[k][t]:.2f}" for k in shown),
         ]

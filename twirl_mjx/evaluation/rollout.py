@@ -15,7 +15,7 @@ from twirl_mjx.sim.dynamics import Dynamics
 from twirl_mjx.tasks.vector import EnvState, VectorEnv
 
 ActFn = Callable[[Any, Any, EnvState, jax.Array], tuple[jax.Array, Any]]
-"""(parameters, memory, state, key) -> (actions [N, 12], memory)."""
+"""(parameters, memory, state, key) -> (actions [N, A], memory)."""
 
 
 def first_episodes(

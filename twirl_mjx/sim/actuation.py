@@ -118,9 +118,7 @@ def derating(temperature: jax.Array) -> jax.Array:
 
 def motor_command(robot: Robot, motors: MotorState, target: jax.Array) -> MotorCommand:
     """Return gains and torque limits for one control step towards ``target`` [J] rad."""
-    kp, kd, limit = (
-        jnp.asarray(x, jnp.float32) for x in (robot.kp, robot.kd, robot.torque_limit)
-    )
+    kp, kd, limit = (jnp.asarray(x, jnp.float32) for x in (robot.kp, robot.kd, robot.torque_limit))
     return MotorCommand(
         target=target,
         kp=kp * motors.strength,

@@ -8,7 +8,7 @@ that every robot meets the ground and its motors in the same way.
 from __future__ import annotations
 
 import functools
-import os
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -22,7 +22,6 @@ from twirl_mjx.sim.robot import (
     CALF,
     FOOT,
     HIP,
-    LEG_JOINTS,
     LEG_SIZE,
     NUM_LEGS,
     ROOT_SIZE,
@@ -63,7 +62,9 @@ def load(name: str, model: ModelSource) -> mujoco.MjSpec:
         return mujoco.MjSpec.from_string(text) if text else mujoco.MjSpec.from_file(str(source))
     except ValueError as error:
         reason = " ".join(str(error).split())
-        raise ValueError(f"robot {name!r}: {source if text is None else 'its XML'}: {reason}") from None
+        raise ValueError(
+            f"robot {name!r}: {source if text is None else 'its XML'}: {reason}"
+        ) from None
 
 
 @dataclass(frozen=True)
@@ -154,10 +155,7 @@ def read_facts(
     ids = [raw.joint(joint).id for joint in joints]
     dofs = raw.jnt_dofadr[ids]
     facts: dict[str, Any] = {
-        "legs": tuple(
-            os.path.commonprefix(joints[LEG_SIZE * i : LEG_SIZE * (i + 1)]).strip("_")
-            for i in range(NUM_LEGS)
-        ),
+        "legs": tuple(_common_start(leg) for leg in itertools.batched(joints, LEG_SIZE)),
         "joint_limits": raw.jnt_range[ids],
         "armature": raw.dof_armature[dofs],
         "damping": raw.dof_damping[dofs],
@@ -175,19 +173,29 @@ def read_facts(
     return facts
 
 
+def _common_start(names: Sequence[str]) -> str:
+    """Return what the joint names of a leg begin with: its name."""
+    same = itertools.takewhile(lambda letters: len(set(letters)) == 1, zip(*names, strict=False))
+    return "".join(letters[0] for letters in same).strip("_")
+
+
 def _read_feet(
     name: str, raw: mujoco.MjModel, frame: Frame, feet: Sequence[str]
 ) -> tuple[float, float]:
     """Return the calf length and the foot radius in m that the feet of the file have."""
     if len(feet) != NUM_LEGS:
-        raise ValueError(f"robot {name!r}: feet are {list(feet)}; need {NUM_LEGS}, one for each leg")
+        raise ValueError(
+            f"robot {name!r}: feet are {list(feet)}; need {NUM_LEGS}, one for each leg"
+        )
     data = mujoco.MjData(raw)
     mujoco.mj_kinematics(raw, data)
     geoms = [raw.geom(i).name for i in range(raw.ngeom)]
     sites = [raw.site(i).name for i in range(raw.nsite)]
     found = []
     for foot, leg in zip(feet, frame.links, strict=True):
-        check_choice(f"foot (geom or site) of robot {name!r}", foot, tuple(filter(None, geoms + sites)))
+        check_choice(
+            f"foot (geom or site) of robot {name!r}", foot, tuple(filter(None, geoms + sites))
+        )
         what = "geom" if foot in geoms else "site"
         here, calf = getattr(data, what)(foot).xpos, data.body(leg[-1])
         x, y, z = calf.xmat.reshape(3, 3).T @ (here - calf.xpos)
@@ -282,7 +290,7 @@ def source_model(robot: Robot) -> mujoco.MjModel:
         named = field.name in ("trunk", "links")
         if not (mine == found if named else np.allclose(mine, found, atol=TOLERANCE)):
             raise ValueError(
-                f"robot {robot.name!r}: {field.name} is {mine} in the record but {found} in its MJCF"
+                f"robot {robot.name!r}: {field.name} is {mine} in the record, {found} in its MJCF"
             )
     return raw
 
@@ -313,6 +321,11 @@ def robot_spec(robot: Robot, colliding: Sequence[str]) -> mujoco.MjSpec:
     spec.option.solver = mujoco.mjtSolver.mjSOL_NEWTON
     spec.option.impratio = 1.0
     return spec
+
+
+def robot_model(robot: Robot) -> mujoco.MjModel:
+    """Return the compiled robot without a scene, feet and calves able to meet a ground."""
+    return robot_spec(robot, (FOOT, CALF)).compile()
 
 
 def _keep_masses(spec: mujoco.MjSpec, raw: mujoco.MjModel) -> None:

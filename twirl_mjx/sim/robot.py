@@ -313,9 +313,7 @@ def check_record(robot: Robot) -> None:
         if field.type == "np.ndarray":
             value.flags.writeable = False
             object.__setattr__(robot, field.name, value)
-    check_range(
-        f"robot {robot.name!r}: cutoff_hz", robot.cutoff_hz, 0.01, 0.49 / robot.control_dt
-    )
+    check_range(f"robot {robot.name!r}: cutoff_hz", robot.cutoff_hz, 0.01, 0.49 / robot.control_dt)
     low, high = robot.joint_limits.T
     for joint, angle, start, stop in zip(robot.joints, robot.default_pose, low, high, strict=True):
         check_range(f"robot {robot.name!r}: default_pose of {joint}", float(angle), start, stop)

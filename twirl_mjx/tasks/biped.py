@@ -1,8 +1,9 @@
 """Task ``biped``: walk to a goal on the hind legs (paper, "Bipedal Navigation Task").
 
-Observation [101]: ``observations.UPRIGHT``. Action [12] in [-1, 1]. Goal: uniform on a circle of
-radius ~ Exp(mean 1.5 m) clipped to [0.3, 5] m. Reward: r_stand (1 + r_facing + r_distance).
-Terminates when trunk, hip or thigh touches the ground (not the calf, README, decision 6).
+Observation: ``observations.proprioceptive`` with axes (A1: [101]). Action [A] in [-1, 1]. Goal:
+uniform on a circle of radius ~ Exp(mean 1.5 m) clipped to [0.3, 5] m.
+Reward: r_stand (1 + r_facing + r_distance). Terminates when trunk, hip or thigh touches the ground
+(not the calf, README, decision 6).
 """
 
 from __future__ import annotations
@@ -12,9 +13,11 @@ import jax
 import jax.numpy as jnp
 
 from twirl_mjx.config import TrainConfig
-from twirl_mjx.sim import a1, frames
+from twirl_mjx.sim import frames
 from twirl_mjx.sim.dynamics import Dynamics
-from twirl_mjx.sim.scene import CONTROL_DT, CollisionSet, Scene
+from twirl_mjx.sim.robot import HIP, THIGH, TRUNK, Robot
+from twirl_mjx.sim.robots import A1
+from twirl_mjx.sim.scene import CollisionSet, Scene
 from twirl_mjx.tasks import base, rewards
 from twirl_mjx.tasks.observations import ProprioceptiveObserver
 
@@ -54,10 +57,11 @@ class Biped:
         "goal_distance", "fall",
     )  # fmt: skip
 
-    def __init__(self, config: TrainConfig) -> None:
+    def __init__(self, config: TrainConfig, robot: Robot = A1) -> None:
         """Keep the options of the task."""
         self._config = config
-        self.observer = ProprioceptiveObserver(axes=True)
+        self.robot = robot
+        self.observer = ProprioceptiveObserver(robot, axes=True)
 
     def start(self, key: jax.Array, scene: Scene, dynamics: Dynamics) -> base.Start:
         """Start on four feet with a goal."""
@@ -74,7 +78,7 @@ class Biped:
 
     def _progress(self, distance: jax.Array, previous: jax.Array) -> jax.Array:
         if self._config.biped.distance_reward == "speed":
-            return rewards.approach_speed(distance, previous, CONTROL_DT)
+            return rewards.approach_speed(distance, previous, self.robot.control_dt)
         return rewards.distance_progress(distance, previous)
 
     def judge(self, world: base.World, view: base.View, scene: Scene) -> base.Outcome:
@@ -86,7 +90,7 @@ class Biped:
         facing = rewards.normalised_cosine(rewards.facing_cosine(z_axis, displacement))
         progress = self._progress(distance, world.task.previous_distance)
         weight = self._config.biped.distance_weight
-        fall = base.touches(view, a1.TRUNK, a1.HIP, a1.THIGH)
+        fall = base.touches(view, TRUNK, HIP, THIGH)
         return base.Outcome(
             reward=(upright + bonus) * (1.0 + facing + weight * progress),
             terminated=fall,

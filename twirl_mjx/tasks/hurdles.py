@@ -1,7 +1,7 @@
 """Task ``hurdles``: jump over randomly spaced hurdles (paper, "Jumping Task").
 
-Observation [95]: ``observations.PROPRIOCEPTIVE``. Action [12] in [-1, 1]. Goal: centre of the next
-hurdle; a hurdle is passed when the root is 0.4 m beyond it. Reward: the four terms of ``WEIGHTS``.
+Observation: ``observations.proprioceptive`` (A1: [95]). Action [A] in [-1, 1]. Goal: centre of the
+next hurdle; a hurdle is passed when the root is 0.4 m beyond it. Reward: the terms of ``WEIGHTS``.
 Terminates when any part of the robot touches a hurdle at any physics substep, or the trunk touches
 the ground.
 """
@@ -18,9 +18,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from twirl_mjx.config import TrainConfig
-from twirl_mjx.sim import a1, frames, kinematics
+from twirl_mjx.sim import frames, kinematics
 from twirl_mjx.sim.dynamics import Dynamics
-from twirl_mjx.sim.scene import BUMP_HALF_SIZE, CONTROL_DT, CollisionSet, Scene
+from twirl_mjx.sim.robot import FOOT, TRUNK, Robot
+from twirl_mjx.sim.robots import A1
+from twirl_mjx.sim.scene import BUMP_HALF_SIZE, CollisionSet, Scene
 from twirl_mjx.tasks import bands, base, rewards
 from twirl_mjx.tasks.observations import ProprioceptiveObserver
 
@@ -67,17 +69,18 @@ class Crossing(flax.struct.PyTreeNode):
 def watch(
     scene: Scene, dynamics: Dynamics, qpos_trace: jax.Array, positions: jax.Array
 ) -> Crossing:
-    """Test every physics substep ``qpos_trace`` [S, 19] against hurdles at ``positions`` [H]."""
-    points = kinematics.forward(qpos_trace)
+    """Test every physics substep ``qpos_trace`` [S, 7 + J] against hurdles at ``positions`` [H]."""
+    robot = scene.robot
+    points = kinematics.forward(robot, qpos_trace)
     x = points.endpoints[..., 0]
     height = points.endpoints[..., 2] - base.ground_at(scene, dynamics, points.endpoints[..., :2])
-    radii = jnp.asarray(a1.CONTACT_RADII, jnp.float32)
+    radii = jnp.asarray(robot.contact_radii, jnp.float32)
     band = bands.nearest(positions, qpos_trace[:, 0])
-    feet = np.flatnonzero(base.FEET)
+    feet = np.flatnonzero(robot.contact_mask(FOOT))
     return Crossing(
         hit=jnp.any(bands.shape_distance(x, height, radii, band) <= 0.0),
         stepped_in=bands.stepped_in(
-            positions, x[:, feet, 0], height[:, feet, 0] < a1.FOOT_RADIUS + FOOT_CONTACT
+            positions, x[:, feet, 0], height[:, feet, 0] < robot.foot_radius + FOOT_CONTACT
         ),
         last_foot=jnp.min(x[-1, feet, 0]),
     )
@@ -121,7 +124,7 @@ class Hurdles:
         "goal_distance",
     )  # fmt: skip
 
-    def __init__(self, config: TrainConfig) -> None:
+    def __init__(self, config: TrainConfig, robot: Robot = A1) -> None:
         """Keep the options of the task.
 
         Raises:
@@ -133,17 +136,19 @@ class Hurdles:
         if config.fixed_course:
             self._gaps = (options.fixed_gap, options.fixed_gap)
         low, high = self._gaps
-        if not bands.MIN_GAP <= low <= high:
+        least = bands.min_gap(robot)
+        if not least <= low <= high:
             raise ValueError(
                 f"hurdles have gaps from {low} to {high} m: the smallest must be at least"
-                f" {bands.MIN_GAP} m and the largest no smaller"
-                f" (nearest: {max(low, bands.MIN_GAP)} to {max(low, high, bands.MIN_GAP)})"
+                f" {least} m and the largest no smaller"
+                f" (nearest: {max(low, least)} to {max(low, high, least)})"
             )
         env = config.env
-        seconds = max(env.episode_length, env.train_episode_length or 0) * CONTROL_DT
+        seconds = max(env.episode_length, env.train_episode_length or 0) * robot.control_dt
         self.num_hurdles = math.ceil(seconds * MAX_SPEED / low) + 1
         """H, never all passed in an episode."""
-        self.observer = ProprioceptiveObserver(axes=False)
+        self.robot = robot
+        self.observer = ProprioceptiveObserver(robot, axes=False)
 
     def start(self, key: jax.Array, scene: Scene, dynamics: Dynamics) -> base.Start:
         """Start on four feet, the first hurdle as far ahead as the others are apart."""
@@ -180,7 +185,7 @@ class Hurdles:
             "hurdle": bonus(self._options.hurdle_bonus, world.task, state),
         }
         goal = next_goal(state)
-        fall = base.touches(view, a1.TRUNK)
+        fall = base.touches(view, TRUNK)
         return base.Outcome(
             reward=sum((WEIGHTS[name] * term for name, term in terms.items()), jnp.zeros(())),
             terminated=crossing.hit | fall,

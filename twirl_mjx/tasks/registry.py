@@ -64,7 +64,10 @@ def make_env(
         )
     task = make_task(config)
     scene = build_scene(
-        scene_kind or get_shift(config.shift).scene, collision=task.collision, options=SimOptions()
+        scene_kind or get_shift(config.shift).scene,
+        robot=task.robot,
+        collision=task.collision,
+        options=SimOptions(),
     )
     return VectorEnv(
         task,

@@ -1,6 +1,7 @@
 """Task ``stand``: get up on the hind legs and stay there. Source of ``biped``.
 
-Observation [101]: ``observations.UPRIGHT``. Action [12] in [-1, 1]. Reward: r_upright + r_height.
+Observation: ``observations.proprioceptive`` with axes (A1: [101]). Action [A] in [-1, 1].
+Reward: r_upright + r_height.
 Terminates when any part but the feet touches the ground (paper, "Training the source policy").
 A goal is drawn as in ``biped`` and shown, but nothing depends on it: both tasks then share their
 observation, and the source has learned to ignore the goal.
@@ -12,8 +13,10 @@ import jax
 import jax.numpy as jnp
 
 from twirl_mjx.config import TrainConfig
-from twirl_mjx.sim import a1, frames
+from twirl_mjx.sim import frames
 from twirl_mjx.sim.dynamics import Dynamics
+from twirl_mjx.sim.robot import CALF, HIP, THIGH, TRUNK, Robot
+from twirl_mjx.sim.robots import A1
 from twirl_mjx.sim.scene import CollisionSet, Scene
 from twirl_mjx.tasks import base, rewards
 from twirl_mjx.tasks.biped import draw_goal
@@ -30,10 +33,11 @@ class Stand:
     collision: CollisionSet = "feet"
     metric_names = ("upright", "height", "cosine", "standing", "front_foot_height", "fall")
 
-    def __init__(self, config: TrainConfig) -> None:
+    def __init__(self, config: TrainConfig, robot: Robot = A1) -> None:
         """Keep the options of the task."""
         self._config = config
-        self.observer = ProprioceptiveObserver(axes=True)
+        self.robot = robot
+        self.observer = ProprioceptiveObserver(robot, axes=True)
 
     def start(self, key: jax.Array, scene: Scene, dynamics: Dynamics) -> base.Start:
         """Start on four feet, or part-way up in a share ``risen_fraction`` of the episodes."""
@@ -41,9 +45,10 @@ class Stand:
         qpos, qvel = base.start_on_feet(pose_key, scene, dynamics)
         if self._config.stand.risen_fraction > 0.0:
             pitch = jax.random.uniform(pitch_key, maxval=RISEN_PITCH_DEG * jnp.pi / 180)
-            risen = base.risen_pose(pitch)
+            risen = base.risen_pose(scene.robot, pitch)
             risen = risen.at[:2].set(qpos[:2])
-            risen = risen.at[7:].add(qpos[7:] - jnp.asarray(a1.DEFAULT_POSE, jnp.float32))
+            pose = jnp.asarray(scene.robot.default_pose, jnp.float32)
+            risen = risen.at[7:].add(qpos[7:] - pose)
             risen = base.place_on_ground(scene, dynamics, risen)
             take = jax.random.uniform(risen_key) < self._config.stand.risen_fraction
             qpos = jnp.where(take, risen, qpos)
@@ -58,10 +63,10 @@ class Stand:
     def judge(self, world: base.World, view: base.View, scene: Scene) -> base.Outcome:
         """Score one control step."""
         cosine = frames.base_axes(view.qpos[3:7])[0][2]
-        front = jnp.mean(base.foot_clearance(view)[jnp.asarray(a1.FRONT_LEGS)]) + a1.FOOT_RADIUS
+        front = jnp.mean(base.front_feet(view)) + view.robot.foot_radius
         height = view.height if self._config.stand.height_of == "root" else front
         upright, bonus = rewards.normalised_cosine(cosine), rewards.height_bonus(height)
-        fall = base.touches(view, a1.TRUNK, a1.HIP, a1.THIGH, a1.CALF)
+        fall = base.touches(view, TRUNK, HIP, THIGH, CALF)
         return base.Outcome(
             reward=upright + bonus,
             terminated=fall,

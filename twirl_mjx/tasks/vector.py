@@ -159,7 +159,9 @@ class VectorEnv:
             raise ValueError(f"action has shape {jnp.shape(action)}, need {need}")
         finite_action = jnp.all(jnp.isfinite(action), axis=-1)
         action = jnp.clip(jnp.nan_to_num(action.astype(jnp.float32)), -1.0, 1.0)
-        world, command = jax.vmap(functools.partial(_command, self.scene.robot))(state.world, action)
+        world, command = jax.vmap(functools.partial(_command, self.scene.robot))(
+            state.world, action
+        )
         data, trace = self.engine.step(state.data, command, world.dynamics)
         world, next_obs, outcome, finite = jax.vmap(self._judge_world)(world, command, trace)
         invalid = ~(finite & finite_action)
@@ -233,9 +235,7 @@ class VectorEnv:
         return _select(done, (fresh, fresh_world, fresh_obs), live)
 
 
-def _command(
-    robot: Robot, world: World, action: jax.Array
-) -> tuple[World, actuation.MotorCommand]:
+def _command(robot: Robot, world: World, action: jax.Array) -> tuple[World, actuation.MotorCommand]:
     wanted = actuation.action_to_target(robot, action)
     target, filter_state = actuation.filter_step(robot, world.filter, wanted)
     command = actuation.motor_command(robot, world.motors, target)
