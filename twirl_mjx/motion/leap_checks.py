@@ -107,9 +107,8 @@ def inverse_dynamics(clip: Clip, friction: float = 0.6) -> Dynamics:
         clip: The motion; accelerations are central differences of its frames.
         friction: Friction coefficient of the pyramids the forces must lie in.
     """
-    model = robot_model(clip.robot)
-    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
-    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_LIMIT
+    model, off = robot_model(clip.robot), mujoco.mjtDisableBit
+    model.opt.disableflags |= off.mjDSBL_CONTACT | off.mjDSBL_LIMIT
     data = mujoco.MjData(model)
     qvel = np.concatenate(frame_velocities(clip), axis=1)[:-1]
     qacc = _accelerations(clip, model)
@@ -212,12 +211,8 @@ def _kinematic_findings(clip: Clip) -> list[Finding]:
     """Return findings about speed, joints, feet and smoothness."""
     distance = float(clip.cycle_displacement[0])
     robot = clip.robot
-    box = np.stack([sign * robot.action_half_range for sign in (-1, 1)], axis=1)
-    low, high = (robot.default_pose[:, None] + box).T
-    low, high = (
-        np.maximum(low, robot.joint_limits[:, 0]),
-        np.minimum(high, robot.joint_limits[:, 1]),
-    )
+    box = robot.default_pose[:, None] + np.outer(robot.action_half_range, [-1.0, 1.0])
+    low, high = np.clip(box.T, *robot.joint_limits.T)
     inside = float(np.minimum(clip.joint_pos - low, high - clip.joint_pos).min())
     feet, standing = foot_paths(clip), standing_feet(clip)
     both = standing[1:] & standing[:-1]
@@ -273,7 +268,7 @@ def _flight_findings(clip: Clip, dynamics: Dynamics) -> list[Finding]:
 
 
 def ideal_targets(clip: Clip, dynamics: Dynamics) -> np.ndarray:
-    """Return the PD targets [F-1, J] in rad at which the motors give just the clip's torques."""
+    """Return the PD targets [F-1, J] in rad that make the motors give the clip's torques."""
     rate = np.concatenate(frame_velocities(clip), axis=1)[:-1, 6:]
     return clip.joint_pos[:-1] + (dynamics.torque + clip.robot.kd * rate) / clip.robot.kp
 
@@ -281,12 +276,11 @@ def ideal_targets(clip: Clip, dynamics: Dynamics) -> np.ndarray:
 def feed_forward(clip: Clip, dynamics: Dynamics) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the periodic 20 Hz actions whose filtered PD targets come closest to the ideal ones.
 
-    The ideal target ``q + (torque + kd dq) / kp`` makes a PD motor give exactly the torque of the
-    inverse dynamics. The cycle is taken as the nearest whole number K of control steps.
+    The cycle is taken as the nearest whole number K of control steps.
 
     Returns:
-        Actions [K, 12] in [-1, 1], the PD targets they give [K, 12] and the ideal targets, averaged
-        over the control steps [K, 12], both in rad.
+        Actions [K, J] in [-1, 1], the PD targets [K, J] in rad that they give, and the ideal ones
+        averaged over the control steps [K, J].
     """
     robot = clip.robot
     ideal = ideal_targets(clip, dynamics)
@@ -313,8 +307,7 @@ def feed_forward(clip: Clip, dynamics: Dynamics) -> tuple[np.ndarray, np.ndarray
 
 def _motor_findings(clip: Clip, dynamics: Dynamics) -> list[Finding]:
     """Return findings about torques and about what the 20 Hz controller must be told."""
-    target = ideal_targets(clip, dynamics)
-    low, high = clip.robot.joint_limits.T
+    target, (low, high) = ideal_targets(clip, dynamics), clip.robot.joint_limits.T
     beyond = np.maximum(target - high, low - target).max()
     _, given, wanted = feed_forward(clip, dynamics)
     missed = float(np.sqrt(((given - wanted) ** 2).mean(axis=0)).max())

@@ -23,7 +23,7 @@ LEG_JOINTS = ("hip", "thigh", "calf")
 NUM_LEGS = 4
 LEG_SIZE = len(LEG_JOINTS)
 ROOT_SIZE = 7
-"""Numbers of the free trunk in ``qpos``: position and quaternion; its velocity has 6."""
+"""Numbers of the free trunk in ``qpos``: position and quaternion; in ``qvel`` it has 6."""
 
 TRUNK, HIP, THIGH, CALF, FOOT = "trunk", "hip", "thigh", "calf", "foot"
 BODY_CLASSES = (TRUNK, HIP, THIGH, CALF, FOOT)
@@ -151,7 +151,7 @@ class Robot:
 
         Args:
             name: Name of the robot.
-            model: Path, XML string, or function returning either.
+            model: Its MJCF.
             feet: [4] geoms or sites at the centres of the feet, in the order of the legs.
             default_pose: rad, joint angles of the zero action.
             action_half_range: rad, joint offset of a unit action.
@@ -164,11 +164,11 @@ class Robot:
             FileNotFoundError: There is no such file.
             ValueError: The model is of another family, or a fact is missing or unknown.
         """
-        from twirl_mjx.sim import mjcf
+        from twirl_mjx.sim.read_mjcf import read_facts
 
         facts |= {"default_pose": default_pose, "action_half_range": action_half_range}
         facts |= {"kp": kp, "kd": kd}
-        return cls(**mjcf.read_facts(name, model, feet, facts))
+        return cls(**read_facts(name, model, feet, facts))
 
     @property
     def num_joints(self) -> int:
@@ -179,11 +179,6 @@ class Robot:
     def nq(self) -> int:
         """Numbers in ``qpos``."""
         return ROOT_SIZE + self.num_joints
-
-    @property
-    def nv(self) -> int:
-        """Numbers in ``qvel``."""
-        return ROOT_SIZE - 1 + self.num_joints
 
     @property
     def actuators(self) -> tuple[str, ...]:
@@ -262,9 +257,9 @@ class Robot:
     @functools.cached_property
     def mass(self) -> float:
         """Total mass in kg, read from the model."""
-        from twirl_mjx.sim import mjcf
+        from twirl_mjx.sim.mjcf import source_model
 
-        model = mjcf.source_model(self)
+        model = source_model(self)
         return float(model.body_subtreemass[model.body(self.trunk).id])
 
 
@@ -290,8 +285,7 @@ RANGES: dict[str, tuple[float, float]] = {
 def check_record(robot: Robot) -> None:
     """Check a record and make its arrays read-only; see ``Robot.__post_init__``."""
     count = NUM_LEGS * LEG_SIZE
-    sizes = {"legs": NUM_LEGS, "joints": count, "links": NUM_LEGS}
-    for field, size in sizes.items():
+    for field, size in (("legs", NUM_LEGS), ("joints", count), ("links", NUM_LEGS)):
         value = getattr(robot, field)
         if len(value) != size or len(set(value)) != size:
             raise ValueError(
@@ -317,18 +311,13 @@ def check_record(robot: Robot) -> None:
     low, high = robot.joint_limits.T
     for joint, angle, start, stop in zip(robot.joints, robot.default_pose, low, high, strict=True):
         check_range(f"robot {robot.name!r}: default_pose of {joint}", float(angle), start, stop)
-    _check_corners(robot)
-    _check_shapes(robot)
-
-
-def _check_corners(robot: Robot) -> None:
-    x, y = robot.hip_offsets[:, 0], robot.hip_offsets[:, 1]
-    corners = {(bool(a > 0), bool(b > 0)) for a, b in zip(x, y, strict=True)}
-    if len(corners) != NUM_LEGS or not (np.abs(y) > 0).all():
+    corners = {(x > 0, y > 0) for x, y in robot.hip_offsets[:, :2].tolist() if y != 0}
+    if len(corners) != NUM_LEGS:
         raise ValueError(
             f"robot {robot.name!r}: hips at {robot.hip_offsets[:, :2].tolist()} m (x, y); need one"
             " in each of front right, front left, hind right, hind left of the trunk's origin"
         )
+    _check_shapes(robot)
 
 
 def _check_shapes(robot: Robot) -> None:

@@ -210,7 +210,7 @@ def start_on_feet(key: jax.Array, scene: Scene, dynamics: Dynamics) -> tuple[jax
     )
     upright = jnp.array([robot.home_height, 1.0, 0.0, 0.0, 0.0], jnp.float32)
     qpos = jnp.concatenate([start_xy(place_key, scene), upright, joints])
-    return place_on_ground(scene, dynamics, qpos), jnp.zeros(robot.nv)
+    return place_on_ground(scene, dynamics, qpos), jnp.zeros(robot.nq - 1)
 
 
 def risen_pose(robot: Robot, pitch: jax.Array) -> jax.Array:

@@ -1,8 +1,8 @@
 """Task ``imitate``: track a leap clip (Peng et al. 2020). Source of ``hurdles``.
 
 Observation: ``make_layout`` (A1: [160]). Action [A] in [-1, 1]. Reward: the terms of ``WEIGHTS``
-(paper Table 2), 1 for a perfect tracker. Episodes start on the reference at a random phase, with its
-velocities; a share of them starts at rest on four feet instead, as episodes of other tasks do.
+(paper Table 2), 1 for a perfect tracker. Episodes start on the reference at a random phase, at its
+speed; a share of them starts at rest on four feet instead, as episodes of other tasks do.
 Whenever the clip loops, the reference moves to where the robot is (root xy only).
 Terminates when the root is ``max_root_error`` or ``max_root_angle`` away from the reference, or
 trunk, hips, thighs or knees touch the ground. The lower ends of the calves do not count: in the
@@ -55,18 +55,13 @@ STANDING_TOLERANCE = 0.005
 def make_layout(robot: Robot) -> tuple[Entry, ...]:
     """Return the layout of the observation (A1: 160 numbers).
 
-    ``_h``: in the robot's present heading frame (world axes turned by its yaw; in the history, by
-    its yaw at that time). Quaternions wxyz with w >= 0.
+    ``_h``: in the heading frame (world axes turned by the robot's yaw at that time); w >= 0.
     """
     tilt, joints = Entry("base_quat_h", 4, "1"), Entry("joint_pos", robot.num_joints, "rad")
     target = (Entry("base_displacement_h", 3, "m"), tilt, joints)
     return (
         *in_history((tilt, joints, Entry("previous_action", robot.num_joints, "1"))),
-        *(
-            Entry(f"target_{entry.name}[+{step}]", entry.size, entry.unit)
-            for step in TARGET_STEPS
-            for entry in target
-        ),
+        *(Entry(f"target_{e.name}[+{i}]", e.size, e.unit) for i in TARGET_STEPS for e in target),
     )
 
 
@@ -79,8 +74,7 @@ def load_clip(name: str, robot: Robot = A1) -> Clip:
 
     Raises:
         FileNotFoundError: There is no such file.
-        ValueError: The file is not a clip, its motion does not go on after its last frame, or the
-            shipped clip is asked for another robot than the one it was planned for.
+        ValueError: The file is no clip, its motion ends, or the shipped clip is another robot's.
     """
     if name == "leap" and robot is not A1:
         raise ValueError(
