@@ -51,6 +51,9 @@ DRAWN_HALF_WIDTH = 1.5
 BUMPY_PIECES = (2, 20)
 """Pieces in x and y of which a band on a heightfield is drawn, each lying on its own ground."""
 
+MESH_ARRAYS = ("mesh_vert", "mesh_normal", "mesh_face")
+"""Arrays of some 100 000 rows in a robot's file, which would make tracing take minutes."""
+
 HeightOf = Callable[[np.ndarray], np.ndarray]
 """Ground height [K] in m under world positions [K, 2]."""
 
@@ -117,10 +120,12 @@ class Scene:
 
     @functools.cached_property
     def mjx_model(self) -> mjx.Model:
-        """The model on the device."""
+        """The model on the device, without the meshes: they are seen, but nothing meets them."""
         # First asked for inside a trace, it must hold arrays all the same: it is kept.
         with jax.ensure_compile_time_eval():
-            return mjx.put_model(self.mj_model)
+            model = mjx.put_model(self.mj_model)
+        unseen = {name: getattr(model, name)[:0] for name in MESH_ARRAYS} if model.nmesh else {}
+        return model.replace(**unseen)
 
 
 def unit_bumps() -> np.ndarray:
