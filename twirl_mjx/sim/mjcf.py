@@ -163,8 +163,8 @@ def _set_keys(spec: mujoco.MjSpec, robot: Robot) -> None:
     names = []
     for key in list(spec.keys):
         qpos = np.array(key.qpos)
-        other_home = key.name == "home" and not np.allclose(qpos, home, atol=TOLERANCE)
-        if len(qpos) != robot.nq or other_home:
+        fits = len(qpos) == robot.nq
+        if not fits or (key.name == "home" and not np.allclose(qpos, home, atol=TOLERANCE)):
             spec.delete(key)
             continue
         key.ctrl = qpos[ROOT_SIZE:]

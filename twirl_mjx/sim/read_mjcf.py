@@ -47,9 +47,12 @@ def load(name: str, model: ModelSource) -> tuple[mujoco.MjSpec, mujoco.MjModel]:
     text = source if isinstance(source, str) and source.lstrip().startswith("<") else None
     if text is None and not Path(source).is_file():
         raise FileNotFoundError(f"robot {name!r}: no MJCF file {source}")
+
+    def parsed() -> mujoco.MjSpec:
+        return mujoco.MjSpec.from_string(text) if text else mujoco.MjSpec.from_file(str(source))
+
     try:
-        spec = mujoco.MjSpec.from_string(text) if text else mujoco.MjSpec.from_file(str(source))
-        return spec, spec.compile()
+        return parsed(), parsed().compile()  # compiling empties the keyframes of a specification
     except ValueError as error:
         reason = " ".join(str(error).split())
         raise ValueError(
