@@ -9,9 +9,9 @@ import jax
 import jax.numpy as jnp
 
 import twirl_mjx
-from twirl_mjx.sim import a1, frames
+from twirl_mjx.sim import frames
+from twirl_mjx.sim.robot import HIP, TRUNK
 from twirl_mjx.tasks import base
-from twirl_mjx.tasks.observations import ProprioceptiveObserver
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,7 +35,6 @@ class Trot(twirl_mjx.Task[Options]):
     }
     caption = ("speed", "goal_distance")
     shows_goal = True
-    observer = ProprioceptiveObserver(axes=False)
 
     def start(self, key, scene, dynamics):
         pose_key, angle_key = jax.random.split(key)
@@ -51,7 +50,7 @@ class Trot(twirl_mjx.Task[Options]):
         speed = jnp.where(distance < 0.2, self.options.speed, view.qvel[:2] @ way / distance)
         level = jnp.maximum(frames.base_axes(view.qpos[3:7])[2][2], 0.0)
         reward = jnp.clip(speed / self.options.speed, 0.0, 1.0) * level**2
-        fall = base.touches(view, a1.TRUNK, a1.HIP)
+        fall = base.touches(view, TRUNK, HIP)
         metrics = {"speed": speed, "level": level, "goal_distance": distance}
         return twirl_mjx.Outcome(
             reward=reward, terminated=fall, goal=world.goal, task=(), metrics=metrics

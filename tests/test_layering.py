@@ -81,7 +81,7 @@ def imported_modules(tree: ast.Module, module: str, *, is_package: bool) -> Iter
 
 
 def part_of(module: str) -> str:
-    """Return the layer of a dotted name: ``twirl_mjx.sim.a1`` -> ``sim``."""
+    """Return the layer of a dotted name: ``twirl_mjx.sim.look`` -> ``sim``."""
     parts = module.split(".")
     return parts[1] if len(parts) > 1 else "__init__"
 
@@ -187,11 +187,11 @@ def test_code_is_short(path: Path) -> None:
 @pytest.mark.parametrize(
     ("module", "source", "fault"),
     [
-        ("twirl_mjx.sim.a1", "from twirl_mjx.tasks import biped", "sim may not import"),
-        ("twirl_mjx.sim.a1", "from ..tasks import biped", "sim may not import"),
-        ("twirl_mjx.sim.a1", "from twirl_mjx import tasks", "sim may not import"),
-        ("twirl_mjx.sim.a1", "def f():\n    import twirl_mjx.tasks.biped", "sim may not import"),
-        ("twirl_mjx.sim.a1", "import twirl_mjx", "sim may not import"),
+        ("twirl_mjx.sim.look", "from twirl_mjx.tasks import biped", "sim may not import"),
+        ("twirl_mjx.sim.look", "from ..tasks import biped", "sim may not import"),
+        ("twirl_mjx.sim.look", "from twirl_mjx import tasks", "sim may not import"),
+        ("twirl_mjx.sim.look", "def f():\n    import twirl_mjx.tasks.biped", "sim may not import"),
+        ("twirl_mjx.sim.look", "import twirl_mjx", "sim may not import"),
         ("twirl_mjx.training.loop", "from twirl_mjx import cli", "training may not import"),
         ("twirl_mjx.evaluation.rollout", "import twirl_mjx.replay.ring", "evaluation may not"),
         ("twirl_mjx.figures.plots", "import jax.numpy as jnp", "figures read tables only"),
@@ -206,9 +206,9 @@ def test_import_rule_catches(module: str, source: str, fault: str) -> None:
 
 
 def test_import_rule_permits() -> None:
-    assert not import_faults("from . import frames, a1", "twirl_mjx.sim", is_package=True)
-    assert not import_faults("from .frames import yaw", "twirl_mjx.sim.a1")
-    assert not import_faults("from twirl_mjx.sim import a1\nimport jax", "twirl_mjx.tasks.stand")
+    assert not import_faults("from . import frames, look", "twirl_mjx.sim", is_package=True)
+    assert not import_faults("from .frames import yaw", "twirl_mjx.sim.look")
+    assert not import_faults("from twirl_mjx.sim import look\nimport jax", "twirl_mjx.tasks.stand")
     assert not import_faults("import twirl_mjx.training.loop", "twirl_mjx.cli")
 
 

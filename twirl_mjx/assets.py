@@ -13,7 +13,7 @@ def asset_path(*parts: str) -> Path:
     """Return the path of an asset file or folder.
 
     Args:
-        *parts: Path components below ``assets/``, for example ``"a1", "a1.xml"``.
+        *parts: Path components below ``assets/``, for example ``"policies", "stand.npz"``.
 
     Returns:
         The existing path.

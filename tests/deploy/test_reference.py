@@ -8,6 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from twirl_mjx.deploy.reference import Observer, Reading, Score, quaternion_matrix
+from twirl_mjx.sim.robots import A1
 from twirl_mjx.tasks.observations import ProprioceptiveObserver
 
 
@@ -56,7 +57,7 @@ def test_observation_by_hand() -> None:
 def test_observation_equals_the_simulation_s(task: str, size: int) -> None:
     qpos, qvel, actions = random_states(6)
     goal = np.array([1.0, -2.0])
-    theirs = ProprioceptiveObserver(axes=size == 101)
+    theirs = ProprioceptiveObserver(A1, axes=size == 101)
     memory = theirs.init(jnp.asarray(qpos[0]), jnp.asarray(qvel[0]))
     ours = Observer(task, reading_of(qpos[0], qvel[0]))
     for i in range(6):

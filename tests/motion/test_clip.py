@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from twirl_mjx.motion.clip import Clip, configurations, frame_velocities, sample, slerp
 from twirl_mjx.motion.formats import foot_paths, read_clip, write_clip
-from twirl_mjx.sim import a1
+from twirl_mjx.sim.robots import A1
 
 SAMPLE = jax.jit(jax.vmap(sample, in_axes=(None, 0)))
 
@@ -31,7 +31,7 @@ def make_clip(num_frames: int = 9, yaw_per_cycle: float = 0.0, **changes: Any) -
     quat = Rotation.from_euler("ZYX", angles).as_quat(scalar_first=True)
     pos = np.stack([1.0 + 0.8 * share, 0.2 + 0.1 * share, 0.3 + 0.03 * np.cos(phase)], axis=1)
     swing = np.sin(phase[:, None] + np.arange(12))
-    clip = Clip(pos, quat, a1.DEFAULT_POSE + 0.2 * swing, frame_duration=0.05, name="walk")
+    clip = Clip(pos, quat, A1.default_pose + 0.2 * swing, frame_duration=0.05, name="walk")
     return dataclasses.replace(clip, **changes)
 
 

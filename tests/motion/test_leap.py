@@ -31,7 +31,8 @@ from twirl_mjx.motion.leap_checks import (
     require_leap,
 )
 from twirl_mjx.motion.tracking import open_loop
-from twirl_mjx.sim import a1, kinematics
+from twirl_mjx.sim import kinematics
+from twirl_mjx.sim.robots import A1
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +42,7 @@ def leap() -> Clip:
 
 @pytest.fixture(scope="module")
 def model() -> planar.PlanarModel:
-    return planar.planar_model(mujoco.MjModel.from_xml_path(str(a1.xml_path())))
+    return planar.planar_model(mujoco.MjModel.from_xml_path(str(A1.model())))
 
 
 def random_motion(model: planar.PlanarModel, seed: int) -> tuple[LeapConfig, leap_plan.LeapMotion]:
@@ -55,7 +56,7 @@ def random_motion(model: planar.PlanarModel, seed: int) -> tuple[LeapConfig, lea
 
 
 def test_planar_model_weighs_what_the_robot_weighs(model: planar.PlanarModel) -> None:
-    robot = mujoco.MjModel.from_xml_path(str(a1.xml_path()))
+    robot = mujoco.MjModel.from_xml_path(str(A1.model()))
     assert model.mass == pytest.approx(robot.body_mass.sum())
     qpos = np.array([0.1, 0, 0.3, np.cos(0.2), 0, np.sin(0.2), 0, *([0, 0.7, -1.5] * 4)])
     data = mujoco.MjData(robot)
@@ -86,13 +87,13 @@ def test_leg_ik_reaches_the_foot(model: planar.PlanarModel) -> None:
     thigh, calf, length = planar.leg_ik(root, pitch, feet)
     states = planar.link_states(model, planar.Pose(root, pitch, thigh, calf))
     shank = pitch[:, None] + thigh + calf
-    reached = states.knee + planar.turn(shank, np.array([0.0, -a1.CALF_LENGTH]))
+    reached = states.knee + planar.turn(shank, np.array([0.0, -A1.calf_length]))
     np.testing.assert_allclose(reached, feet, atol=1e-9)
     np.testing.assert_allclose(np.linalg.norm(feet - states.hip, axis=-1), length)
     joints = np.zeros((50, 4, 3))
     joints[:, :2, 1:] = np.stack([thigh[:, 0], calf[:, 0]], axis=-1)[:, None]
     joints[:, 2:, 1:] = np.stack([thigh[:, 1], calf[:, 1]], axis=-1)[:, None]
-    base = kinematics.foot_positions(joints.reshape(50, 12))[:, [0, 2]][..., [0, 2]]
+    base = kinematics.foot_positions(A1, joints.reshape(50, 12))[:, [0, 2]][..., [0, 2]]
     world = root[:, None] + planar.turn(pitch[:, None], base)
     np.testing.assert_allclose(world, feet, atol=1e-9)
 
@@ -138,7 +139,7 @@ def test_torques_of_the_plan_agree_with_mujoco(model: planar.PlanarModel) -> Non
     config, motion = LeapConfig(), shipped_motion(model)
     joints = leap_solver.joint_motion(config, model, motion)
     clip = motion_to_clip(motion, config.duration, "plan")
-    robot = mujoco.MjModel.from_xml_path(str(a1.xml_path()))
+    robot = mujoco.MjModel.from_xml_path(str(A1.model()))
     robot.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_LIMIT
     data = mujoco.MjData(robot)
     for frame in range(1, 99, 7):
@@ -152,7 +153,7 @@ def test_torques_of_the_plan_agree_with_mujoco(model: planar.PlanarModel) -> Non
         mujoco.mj_inverse(robot, data)
         torque = data.qfrc_inverse[6:].copy()
         for leg in range(4):
-            geom, pair = robot.geom(a1.FOOT_GEOMS[leg]).id, leg // 2
+            geom, pair = robot.geom(A1.feet[leg]).id, leg // 2
             jacobian = np.zeros((3, robot.nv))
             point = data.geom_xpos[geom] * [1, 1, 0]
             mujoco.mj_jac(robot, data, jacobian, None, point, int(robot.geom_bodyid[geom]))
@@ -227,13 +228,13 @@ def test_damaged_leaps_are_refused(
 
 
 def test_a_standing_robot_is_no_leap() -> None:
-    pose = np.array([0, 0, a1.HOME_HEIGHT, 1, 0, 0, 0, *a1.DEFAULT_POSE])
+    pose = np.array([0, 0, A1.home_height, 1, 0, 0, 0, *A1.default_pose])
     qpos = np.repeat(pose[None], 5, axis=0)
     clip = Clip(qpos[:, :3], qpos[:, 3:7], qpos[:, 7:], frame_duration=0.02, name="stand")
     failed = {finding.name for finding in check_leap(clip) if not finding.passed}
     assert {"cycle length", "flight time (from frames)"} <= failed
     dynamics = inverse_dynamics(clip)
-    weight = a1.TOTAL_MASS * planar.GRAVITY
+    weight = A1.mass * planar.GRAVITY
     np.testing.assert_allclose(dynamics.contact_force[:, :, 2].sum(axis=1), weight, rtol=1e-3)
     assert np.abs(dynamics.torque).max() < 10.0
     with pytest.raises(LeapError, match="must wrap"):
@@ -241,14 +242,14 @@ def test_a_standing_robot_is_no_leap() -> None:
 
 
 def test_band_margin_is_the_distance_to_the_box() -> None:
-    pose = np.array([0, 0, a1.HOME_HEIGHT + 0.05, 1, 0, 0, 0, *a1.DEFAULT_POSE])
+    pose = np.array([0, 0, A1.home_height + 0.05, 1, 0, 0, 0, *A1.default_pose])
     qpos = np.repeat(pose[None], 3, axis=0)
     clip = Clip(qpos[:, :3], qpos[:, 3:7], qpos[:, 7:], frame_duration=0.02)
-    front = a1.HIP_OFFSETS[0, 0]
+    front = A1.hip_offsets[0, 0]
     margins = band_margins(clip, np.array([front, front + 0.15, front + 0.2]))
-    beside = np.hypot(0.05, 0.06) - a1.FOOT_RADIUS
+    beside = np.hypot(0.05, 0.06) - A1.foot_radius
     np.testing.assert_allclose(margins[:2], [0.04, beside], atol=1e-6)
-    assert margins[2] == pytest.approx(np.hypot(0.1, 0.06) - a1.FOOT_RADIUS, abs=1e-6)
+    assert margins[2] == pytest.approx(np.hypot(0.1, 0.06) - A1.foot_radius, abs=1e-6)
 
 
 def test_motors_fly_the_leap_without_feedback(leap: Clip) -> None:
@@ -260,12 +261,12 @@ def test_motors_fly_the_leap_without_feedback(leap: Clip) -> None:
     pitch_off = 2 * np.abs(np.arcsin(simulated[:, 5]) - np.arcsin(reference[:, 5]))
     assert pitch_off.max() < np.radians(15)
     assert np.sqrt((off[:10, 7:] ** 2).mean(axis=1)).max() < 0.06
-    feet = kinematics.foot_positions(simulated[:, 7:])
+    feet = kinematics.foot_positions(A1, simulated[:, 7:])
     turned = feet[..., 2] * (1 - 2 * simulated[:, None, 5] ** 2)
     level = (
         simulated[:, 2, None] + turned - feet[..., 0] * np.sin(2 * np.arcsin(simulated[:, None, 5]))
     )
-    assert (level - a1.FOOT_RADIUS).min(axis=1).max() > 0.04  # all four feet at once
+    assert (level - A1.foot_radius).min(axis=1).max() > 0.04  # all four feet at once
 
 
 def test_leap_config_refuses_what_was_not_tried() -> None:

@@ -15,7 +15,7 @@ from twirl_mjx.motion.clip import sample
 from twirl_mjx.motion.leap_checks import feed_forward, inverse_dynamics
 from twirl_mjx.policies.clip import ClipPolicy
 from twirl_mjx.policies.resolve import resolve_policy
-from twirl_mjx.sim import a1
+from twirl_mjx.sim.robots import A1
 from twirl_mjx.tasks.imitate import load_clip, standing_time
 from twirl_mjx.training.presets import make_config
 from twirl_mjx.worlds.make import make_env
@@ -37,7 +37,7 @@ def test_the_phase_of_every_reference_state_is_found(policy: ClipPolicy) -> None
 
 
 def test_a_robot_at_rest_joins_at_the_standing_time(policy: ClipPolicy) -> None:
-    qpos = jnp.concatenate([jnp.array([0, 0, 0.3, 1.0, 0, 0, 0]), jnp.asarray(a1.DEFAULT_POSE)])
+    qpos = jnp.concatenate([jnp.array([0, 0, 0.3, 1.0, 0, 0, 0]), jnp.asarray(A1.default_pose)])
     expected = round(standing_time(load_clip("leap")) / STEP)
     assert int(policy.phase(qpos, jnp.zeros(18))) == expected
 

@@ -12,7 +12,7 @@ from scipy import signal
 
 from twirl_mjx.policies import scripted
 from twirl_mjx.policies.scripted import BOUND, TROT, ClockedGait, Gait, action_table
-from twirl_mjx.sim import a1
+from twirl_mjx.sim.robots import A1
 
 KEY = jax.random.key(0)
 GAITS = pytest.mark.parametrize("gait", [TROT, BOUND], ids=["trot", "bound"])
@@ -21,6 +21,7 @@ GAITS = pytest.mark.parametrize("gait", [TROT, BOUND], ids=["trot", "bound"])
 @flax.struct.dataclass
 class World:
     episode_step: jax.Array
+    action: jax.Array
 
 
 @flax.struct.dataclass
@@ -29,7 +30,7 @@ class State:
 
 
 def make_state(*steps: int) -> State:
-    return State(World(jnp.array(steps, jnp.int32)))
+    return State(World(jnp.array(steps, jnp.int32), jnp.zeros((len(steps), 12))))
 
 
 @GAITS
@@ -55,7 +56,7 @@ def test_filter_turns_the_command_into_the_wanted_path() -> None:
     wanted = np.column_stack(
         [0.3 + 0.2 * np.cos(2 * np.pi * time), 0.1 * np.sin(4 * np.pi * time) - 1.0]
     )
-    command = np.tile(scripted.unfilter(wanted), (20, 1))
+    command = np.tile(scripted.unfilter(A1, wanted), (20, 1))
     b, a = np.asarray(signal.butter(2, 0.4))
     filtered = signal.lfilter(b, a, command, axis=0)
     np.testing.assert_allclose(filtered[-10:], wanted, atol=1e-6)
@@ -107,10 +108,10 @@ def test_numpy_form_resets_and_follows_leading_axes() -> None:
 
 def test_zero_and_random() -> None:
     state = make_state(*range(500))
-    zero, _ = scripted.SCRIPTED["zero"].act(None, state, KEY)
+    zero, _ = scripted.get_scripted("zero").act(None, state, KEY)
     np.testing.assert_array_equal(zero, np.zeros((500, 12)))
-    noise, _ = scripted.SCRIPTED["random"].act(None, state, KEY)
-    other, _ = scripted.SCRIPTED["random"].act(None, state, jax.random.key(1))
+    noise, _ = scripted.get_scripted("random").act(None, state, KEY)
+    other, _ = scripted.get_scripted("random").act(None, state, jax.random.key(1))
     assert noise.shape == (500, 12)
     assert np.abs(noise).max() <= 1.0
     assert np.var(noise) == pytest.approx(1 / 3, abs=0.02)
@@ -119,9 +120,9 @@ def test_zero_and_random() -> None:
 
 def test_registry() -> None:
     assert set(scripted.SCRIPTED) == {"trot", "bound", "zero", "random"}
-    for policy in scripted.SCRIPTED.values():
-        assert hash(policy) is not None  # usable as a static argument of jit
-    assert scripted.get_scripted("trot") is scripted.SCRIPTED["trot"]
+    for name in scripted.SCRIPTED:  # usable as a static argument of jit
+        assert hash(scripted.get_scripted(name)) == hash(scripted.get_scripted(name, A1))
+    assert scripted.get_scripted("trot") == scripted.GaitPolicy(TROT, A1)
     with pytest.raises(ValueError, match="nearest: 'bound'"):
         scripted.get_scripted("bounds")
 
@@ -135,12 +136,12 @@ def test_gait_walks_forward_on_the_real_a1(gait: Gait) -> None:
     episode = rehearse(ClockedGait(gait), task="biped", episodes=1, config=config).episodes[0]
     assert episode.cause == "time"
     assert episode.metrics["forward_speed"] >= 0.3
-    assert episode.qpos[:, 2].min() > 0.7 * a1.HOME_HEIGHT
+    assert episode.qpos[:, 2].min() > 0.7 * A1.home_height
     assert abs(episode.qpos[-1, 1]) < 0.2 * episode.qpos[-1, 0]
 
 
 def test_state_needs_nothing_but_the_clock(count_traces: Any) -> None:
-    counter = count_traces(scripted.SCRIPTED["trot"].act)
+    counter = count_traces(scripted.get_scripted("trot").act)
     act = jax.jit(counter)
     memory = jnp.zeros(2, jnp.int32)
     for step in range(3):

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from twirl_mjx.sim import a1, actuation
+from twirl_mjx.sim import actuation
 from twirl_mjx.sim.actuation import MotorCommand, MotorState
 from twirl_mjx.sim.dynamics import Dynamics, make_dynamics
+from twirl_mjx.sim.robots import A1
 
 CUTOFF = 4.0 / (20.0 / 2)  # 4 Hz at a control rate of 20 Hz, as a share of the Nyquist frequency
 
@@ -21,7 +22,7 @@ def run_filter(start: np.ndarray, targets: np.ndarray) -> tuple[np.ndarray, np.n
     def step(
         state: actuation.FilterState, target: jax.Array
     ) -> tuple[actuation.FilterState, tuple[jax.Array, jax.Array]]:
-        clipped, state = actuation.filter_step(state, target)
+        clipped, state = actuation.filter_step(A1, state, target)
         return state, (clipped, state.outputs[0])
 
     first = actuation.filter_init(jnp.asarray(start, jnp.float32))
@@ -38,27 +39,27 @@ def scipy_filter(start: np.ndarray, targets: np.ndarray) -> np.ndarray:
 
 def test_coefficients_are_scipy_s() -> None:
     b, a = signal.butter(2, 0.4)
-    np.testing.assert_allclose(actuation.BUTTER_B, b, atol=5e-9)  # eight digits are written down
-    np.testing.assert_allclose(actuation.BUTTER_A, a, atol=5e-9)
+    np.testing.assert_allclose(A1.lowpass[0], b, atol=5e-9)  # eight digits are written down
+    np.testing.assert_allclose(A1.lowpass[1], a, atol=5e-9)
 
 
 def test_filter_equals_lfilter() -> None:
     rng = np.random.default_rng(0)
-    start = a1.DEFAULT_POSE + rng.uniform(-0.05, 0.05, 12)
-    targets = a1.DEFAULT_POSE + a1.ACTION_HALF_RANGE * rng.uniform(-1, 1, (60, 12))
+    start = A1.default_pose + rng.uniform(-0.05, 0.05, 12)
+    targets = A1.default_pose + A1.action_half_range * rng.uniform(-1, 1, (60, 12))
     clipped, raw = run_filter(start, targets)
     expected = scipy_filter(start, targets)
-    assert (expected != np.clip(expected, *a1.JOINT_LIMITS.T)).any()  # the clip is exercised
+    assert (expected != np.clip(expected, *A1.joint_limits.T)).any()  # the clip is exercised
     np.testing.assert_allclose(raw, expected, atol=5e-6)
-    np.testing.assert_allclose(clipped, np.clip(expected, *a1.JOINT_LIMITS.T), atol=5e-6)
+    np.testing.assert_allclose(clipped, np.clip(expected, *A1.joint_limits.T), atol=5e-6)
 
 
 def test_filter_rests_and_settles() -> None:
-    start = np.linspace(-0.5, 0.5, 12) + a1.DEFAULT_POSE
+    start = np.linspace(-0.5, 0.5, 12) + A1.default_pose
     _, raw = run_filter(start, np.tile(start, (20, 1)))
     np.testing.assert_allclose(raw, np.tile(start, (20, 1)), atol=1e-5)  # no jump at the start
-    _, raw = run_filter(start, np.tile(a1.DEFAULT_POSE, (60, 1)))
-    np.testing.assert_allclose(raw[-1], a1.DEFAULT_POSE, atol=1e-5)  # unit gain at rest
+    _, raw = run_filter(start, np.tile(A1.default_pose, (60, 1)))
+    np.testing.assert_allclose(raw[-1], A1.default_pose, atol=1e-5)  # unit gain at rest
 
 
 def test_first_filtered_step_by_hand() -> None:
@@ -73,14 +74,14 @@ def test_first_filtered_step_by_hand() -> None:
     [(0.0, 0.0, 0.9, -1.8), (1.0, 0.6, 2.1, -0.6), (-1.0, -0.6, -0.3, -3.0), (0.5, 0.3, 1.5, -1.2)],
 )
 def test_action_scaling_by_hand(action: float, hip: float, thigh: float, calf: float) -> None:
-    target = actuation.action_to_target(jnp.full(12, action))
+    target = actuation.action_to_target(A1, jnp.full(12, action))
     np.testing.assert_allclose(target, np.tile([hip, thigh, calf], 4), atol=1e-6)
 
 
 def test_target_is_clipped_to_joint_limits() -> None:
-    clipped, raw = run_filter(a1.DEFAULT_POSE, np.tile(a1.DEFAULT_POSE - 1.2, (30, 1)))
+    clipped, raw = run_filter(A1.default_pose, np.tile(A1.default_pose - 1.2, (30, 1)))
     np.testing.assert_allclose(clipped[-1], np.tile([-0.80285, -0.3, -2.69653], 4), atol=1e-4)
-    np.testing.assert_allclose(raw[-1], a1.DEFAULT_POSE - 1.2, atol=1e-4)  # memory is not clipped
+    np.testing.assert_allclose(raw[-1], A1.default_pose - 1.2, atol=1e-4)  # memory is not clipped
 
 
 def make_motors(strength: float = 1.0, temperature: float = 25.0) -> MotorState:
@@ -95,11 +96,11 @@ def test_derating_by_hand(temperature: float, share: float) -> None:
 
 
 def test_motor_command_by_hand() -> None:
-    whole = actuation.motor_command(make_motors(), jnp.zeros(12), make_dynamics())
+    whole = actuation.motor_command(A1, make_motors(), jnp.zeros(12), make_dynamics())
     np.testing.assert_allclose(whole.kp, 60.0)
     np.testing.assert_allclose(whole.kd, 3.0)
     np.testing.assert_allclose(whole.torque_limit, 33.5)
-    worn = actuation.motor_command(make_motors(0.5, 80.0), jnp.zeros(12), make_dynamics())
+    worn = actuation.motor_command(A1, make_motors(0.5, 80.0), jnp.zeros(12), make_dynamics())
     np.testing.assert_allclose(worn.kp, 30.0)  # heat takes torque, not gains
     np.testing.assert_allclose(worn.kd, 1.5)
     np.testing.assert_allclose(worn.torque_limit, 33.5 * 0.5 * 0.7, rtol=1e-6)
@@ -108,7 +109,7 @@ def test_motor_command_by_hand() -> None:
 def test_scales_of_gains_and_limits_by_hand() -> None:
     """A motor at half strength and 80 deg C (70 %), under the world's own scales."""
     scales = make_dynamics(overrides={"motor_strength": 0.8, "kp_scale": 1.2, "kd_scale": 0.5})
-    command = actuation.motor_command(make_motors(0.5, 80.0), jnp.zeros(12), scales)
+    command = actuation.motor_command(A1, make_motors(0.5, 80.0), jnp.zeros(12), scales)
     np.testing.assert_allclose(command.kp, 60 * 0.5 * 1.2, rtol=1e-6)
     np.testing.assert_allclose(command.kd, 3 * 0.5 * 0.5, rtol=1e-6)
     np.testing.assert_allclose(command.torque_limit, 33.5 * 0.5 * 0.7 * 0.8, rtol=1e-6)
@@ -120,7 +121,7 @@ def test_scales_of_gains_and_limits_by_hand() -> None:
 def test_latency_keeps_the_last_target_for_whole_substeps(latency: float, late: int) -> None:
     """Ten substeps of 5 ms; 2 ms round to none of them, 3 ms to one."""
     dynamics = make_dynamics().replace(latency=jnp.float32(latency))
-    command = actuation.motor_command(make_motors(), jnp.full(12, 0.1), dynamics)
+    command = actuation.motor_command(A1, make_motors(), jnp.full(12, 0.1), dynamics)
     command = actuation.delay(command, jnp.full(12, 0.3), dynamics, 0.005, 10)
     expected = np.repeat([0.3] * late + [0.1] * (10 - late), 12).reshape(10, 12)
     np.testing.assert_allclose(command.late_targets, expected, rtol=1e-6)
@@ -130,7 +131,7 @@ def test_latency_keeps_the_last_target_for_whole_substeps(latency: float, late: 
 
 
 def test_without_latency_a_command_is_left_alone() -> None:
-    command = actuation.motor_command(make_motors(), jnp.zeros(12), make_dynamics())
+    command = actuation.motor_command(A1, make_motors(), jnp.zeros(12), make_dynamics())
     assert actuation.delay(command, jnp.ones(12), make_dynamics(), 0.005, 10) is command
 
 
@@ -146,7 +147,7 @@ def test_without_latency_a_command_is_left_alone() -> None:
     ],
 )
 def test_pd_torque_by_hand(strength: float, error: float, velocity: float, torque: float) -> None:
-    command = actuation.motor_command(make_motors(strength), jnp.full(12, 0.2), make_dynamics())
+    command = actuation.motor_command(A1, make_motors(strength), jnp.full(12, 0.2), make_dynamics())
     result = actuation.pd_torque(command, jnp.full(12, 0.2 - error), jnp.full(12, velocity))
     np.testing.assert_allclose(result, torque, rtol=1e-5)
 

@@ -14,9 +14,10 @@ import mujoco
 import numpy as np
 import pytest
 
-from twirl_mjx.sim import a1, engine, kinematics, scene
+from twirl_mjx.sim import engine, kinematics, scene
 from twirl_mjx.sim.actuation import MotorCommand
 from twirl_mjx.sim.dynamics import Dynamics, broadcast, make_dynamics
+from twirl_mjx.sim.robots import A1
 from twirl_mjx.sim.scene import Scene, build_scene, terrain_height
 
 N = 3
@@ -62,7 +63,7 @@ def step(request: pytest.FixtureRequest) -> Step:
 
 
 def make_command(
-    target: np.ndarray, *, gain: float = 1.0, limit: np.ndarray | float = a1.TORQUE_LIMIT
+    target: np.ndarray, *, gain: float = 1.0, limit: np.ndarray | float = A1.torque_limit[0]
 ) -> MotorCommand:
     """Return the command of worlds with ``target`` [N, 12]; ``limit`` is one number per world."""
     ones = np.ones(target.shape, np.float32)
@@ -80,9 +81,9 @@ def make_worlds(**leaves: Any) -> Dynamics:
 def standing(height: float, count: int = N) -> tuple[np.ndarray, np.ndarray]:
     """Return qpos and qvel of worlds at rest in the default pose, feet ``height`` m up."""
     qpos = np.zeros((count, 19))
-    qpos[:, 2] = a1.HOME_HEIGHT + height
+    qpos[:, 2] = A1.home_height + height
     qpos[:, 3] = 1.0
-    qpos[:, 7:] = a1.DEFAULT_POSE
+    qpos[:, 7:] = A1.default_pose
     return qpos, np.zeros((count, 18))
 
 
@@ -95,8 +96,10 @@ def moving(height: float, seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.nda
     rng = np.random.default_rng(seed)
     qpos, qvel = standing(0.0)
     qpos[:, 7:] += rng.uniform(-0.1, 0.1, (N, 12))
-    lowest = np.asarray(kinematics.forward(jnp.asarray(qpos, jnp.float32)).feet)[..., 2].min(axis=1)
-    qpos[:, 2] += a1.FOOT_RADIUS + height - lowest
+    lowest = np.asarray(kinematics.forward(A1, jnp.asarray(qpos, jnp.float32)).feet)[..., 2].min(
+        axis=1
+    )
+    qpos[:, 2] += A1.foot_radius + height - lowest
     qvel[:] = rng.uniform(-0.5, 0.5, (N, 18))
     return qpos, qvel, qpos[:, 7:] + rng.uniform(-0.25, 0.25, (N, 12))
 
@@ -118,7 +121,7 @@ def forward_momentum(built: Scene, qpos: np.ndarray, qvel: np.ndarray) -> float:
     data.qpos[:], data.qvel[:] = qpos, qvel
     mujoco.mj_forward(built.mj_model, data)
     mujoco.mj_subtreeVel(built.mj_model, data)
-    return a1.TOTAL_MASS * data.subtree_linvel[built.mj_model.body(a1.TRUNK_BODY).id][0]
+    return A1.mass * data.subtree_linvel[built.mj_model.body(A1.trunk).id][0]
 
 
 def test_friction_slows_a_sliding_robot(flat: Scene, step: Step) -> None:
@@ -134,7 +137,7 @@ def test_friction_slows_a_sliding_robot(flat: Scene, step: Step) -> None:
         momentum.append([forward_momentum(flat, qpos[i], qvel[i]) for i in range(N)])
     braking = (np.array(momentum[1]) - np.array(momentum[3])) / 0.1
     # The load on the feet still swings by a tenth about the weight.
-    np.testing.assert_allclose(braking, friction * a1.TOTAL_MASS * 9.81, rtol=0.15)
+    np.testing.assert_allclose(braking, friction * A1.mass * 9.81, rtol=0.15)
 
 
 def test_smaller_limits_turn_the_joints_less(step: Step) -> None:
@@ -176,14 +179,14 @@ def plain_loop(
     """
     model = built.mj_model.__copy__()
     model.actuator_gainprm[:] = model.actuator_biasprm[:] = 0.0
-    model.dof_damping[6:] += a1.KD
+    model.dof_damping[6:] += A1.kd[0]
     data = mujoco.MjData(model)
     data.qpos[:], data.qvel[:] = qpos, qvel
     positions, velocities = [], []
     for _ in range(built.options.n_substeps):
-        data.qfrc_applied[6:] = a1.KP * (target - data.qpos[7:])
-        torque = data.qfrc_applied[6:] - a1.KD * data.qvel[6:]
-        assert np.abs(torque).max() < a1.TORQUE_LIMIT
+        data.qfrc_applied[6:] = A1.kp[0] * (target - data.qpos[7:])
+        torque = data.qfrc_applied[6:] - A1.kd[0] * data.qvel[6:]
+        assert np.abs(torque).max() < A1.torque_limit[0]
         data.qacc_warmstart[:] *= len(positions) > 0
         mujoco.mj_step(model, data)
         positions.append(data.qpos.copy())
@@ -249,7 +252,7 @@ def test_native_threads_and_vmap_change_nothing(flat: Scene, native_step: Step) 
 def settle(built: Scene, qpos: np.ndarray, worlds: Dynamics, steps: int = 12) -> np.ndarray:
     """Return qpos [N, 19] after standing still for some native control steps."""
     step, qvel = make_step(built, "native"), np.zeros((len(qpos), 18))
-    command = make_command(np.tile(a1.DEFAULT_POSE, (len(qpos), 1)))
+    command = make_command(np.tile(A1.default_pose, (len(qpos), 1)))
     for _ in range(steps):
         pos, vel = step(qpos, qvel, command, worlds)
         qpos, qvel = pos[:, -1], vel[:, -1]
@@ -258,11 +261,11 @@ def settle(built: Scene, qpos: np.ndarray, worlds: Dynamics, steps: int = 12) ->
 
 def foot_gaps(built: Scene, qpos: np.ndarray, worlds: Dynamics) -> np.ndarray:
     """Return the height [N, 4] in m of the lowest point of every foot over our ground."""
-    feet = kinematics.forward(jnp.asarray(qpos, jnp.float32)).feet
+    feet = kinematics.forward(A1, jnp.asarray(qpos, jnp.float32)).feet
     ground = jax.vmap(terrain_height, (None, 0, 0, 0))(
         built, feet[..., :2], worlds.incline, worlds.bump_height
     )
-    return np.asarray(feet[..., 2] - ground) - a1.FOOT_RADIUS
+    return np.asarray(feet[..., 2] - ground) - A1.foot_radius
 
 
 def test_robot_stands_on_the_hill_its_world_has() -> None:

@@ -11,9 +11,10 @@ import mujoco
 import numpy as np
 import pytest
 
-from twirl_mjx.sim import a1, actuation, engine, kinematics
+from twirl_mjx.sim import actuation, engine, kinematics
 from twirl_mjx.sim.actuation import MotorCommand
 from twirl_mjx.sim.dynamics import LEAVES, Dynamics, broadcast, make_dynamics, stack
+from twirl_mjx.sim.robots import A1
 from twirl_mjx.sim.scene import Scene, build_scene
 
 Step = Callable[..., tuple[np.ndarray, np.ndarray]]
@@ -65,10 +66,10 @@ def changed(before: Any, after: Any) -> dict[str, np.ndarray]:
 def test_a_leaf_changes_exactly_its_own_fields(leaf: Any) -> None:
     """In both engines, by the same amounts."""
     built = build_scene(leaf.scene or "flat", collision="feet")
-    whole = actuation.whole_motors()
+    whole = actuation.whole_motors(A1)
 
     def models(dynamics: Dynamics) -> tuple[Any, Any]:
-        command = actuation.motor_command(whole, jnp.zeros(12), dynamics)
+        command = actuation.motor_command(A1, whole, jnp.zeros(12), dynamics)
         return (
             engine.apply_dynamics(built, command, dynamics),
             engine.world_model(built, dynamics),
@@ -123,7 +124,7 @@ def make_late_step(built: Scene, name: engine.EngineName) -> Step:
         qpos: jax.Array, qvel: jax.Array, target: jax.Array, previous: jax.Array, worlds: Dynamics
     ) -> tuple[engine.Trace, jax.Array]:
         def command(target: jax.Array, previous: jax.Array, dynamics: Dynamics) -> MotorCommand:
-            command = actuation.motor_command(actuation.whole_motors(), target, dynamics)
+            command = actuation.motor_command(A1, actuation.whole_motors(A1), target, dynamics)
             return actuation.delay(command, previous, dynamics, built.options.sim_dt, 10)
 
         data = engine.make_data(built, qpos.shape[0]).replace(qpos=qpos, qvel=qvel)
@@ -168,10 +169,10 @@ def test_engines_agree_on_every_leaf_away_from_nominal(flat: Scene) -> None:
     native, mjx = make_late_step(flat, "native"), make_late_step(flat, "mjx")
     rng = np.random.default_rng(3)
     qpos = np.tile(
-        [0, 0, 0, 1, 0, 0, 0, *(a1.DEFAULT_POSE + rng.uniform(-0.1, 0.1, 12))], (count, 1)
+        [0, 0, 0, 1, 0, 0, 0, *(A1.default_pose + rng.uniform(-0.1, 0.1, 12))], (count, 1)
     )
-    feet = np.asarray(kinematics.forward(jnp.asarray(qpos[0], jnp.float32)).feet)
-    qpos[:, 2] = a1.FOOT_RADIUS + 0.001 - feet[:, 2].min()  # just above the ground
+    feet = np.asarray(kinematics.forward(A1, jnp.asarray(qpos[0], jnp.float32)).feet)
+    qpos[:, 2] = A1.foot_radius + 0.001 - feet[:, 2].min()  # just above the ground
     qvel = np.tile(rng.uniform(-0.5, 0.5, 18), (count, 1))
     target = qpos[:, 7:].copy()
     for _ in range(4):

@@ -9,6 +9,7 @@ import pytest
 from twirl_mjx.sim import look
 from twirl_mjx.sim.dynamics import PAPER_SHIFTS, get_shift, make_dynamics
 from twirl_mjx.sim.engine import world_model
+from twirl_mjx.sim.robots import A1
 from twirl_mjx.sim.scene import Bands, build_scene, terrain_height
 
 WHOLE = np.ones(4)
@@ -17,7 +18,7 @@ WHOLE = np.ones(4)
 def painted(shift: str, strength: float, legs: np.ndarray = WHOLE) -> mujoco.MjModel:
     dynamics = make_dynamics(shift, strength)
     model = world_model(build_scene(get_shift(shift).scene), dynamics)
-    look.paint(model, dynamics, legs)
+    look.paint(model, A1, dynamics, legs)
     return model
 
 
@@ -55,7 +56,7 @@ def test_paint_leaves_the_physics_alone() -> None:
 
 def test_captions_have_the_number_of_every_shift() -> None:
     legs = np.array([1.0, 0.63, 1.0, 1.0])
-    shown = {name: look.describe(name, make_dynamics(name), legs) for name in PAPER_SHIFTS}
+    shown = {name: look.describe(name, A1, make_dynamics(name), legs) for name in PAPER_SHIFTS}
     assert shown == {
         "none": "",
         "bumpy": "bumps to 5 cm",

@@ -8,9 +8,10 @@ import mujoco
 import numpy as np
 import pytest
 
-from twirl_mjx.sim import a1, scene
+from twirl_mjx.sim import scene
 from twirl_mjx.sim.dynamics import SceneKind
 from twirl_mjx.sim.engine import write_physics
+from twirl_mjx.sim.robots import A1
 from twirl_mjx.sim.scene import Bands, Scene, SimOptions, build_scene, terrain_height
 
 
@@ -98,7 +99,7 @@ def test_tiles_and_extent(scenes: dict[str, Scene]) -> None:
     model, bumps = scenes["bumpy"].mj_model, scenes["bumpy"].bumps
     size = model.hfield_size[0]
     np.testing.assert_allclose(2 * size[:2] / (np.array(bumps.shape) - 1), 0.3)
-    assert scene.BUMP_CELL >= 2 * a1.FOOT_RADIUS
+    assert 2 * A1.foot_radius <= scene.BUMP_CELL
     heights = model.hfield_data.reshape(bumps.shape) * size[2]  # as compiled: the paper's value
     np.testing.assert_allclose(heights, 0.05 * bumps, atol=1e-7)
     assert bumps.min() == 0.0
@@ -115,7 +116,7 @@ def test_tiles_and_extent(scenes: dict[str, Scene]) -> None:
 )
 def test_collision_sets(collision: scene.CollisionSet, bodies: set[str]) -> None:
     model = build_scene("flat", collision=collision).mj_model
-    for shape in a1.CONTACT_GEOMS:
+    for shape in A1.contact_geoms:
         geom = model.geom(shape.name)
         assert bool(geom.conaffinity[0]) == (shape.body in bodies), shape.name
         assert geom.contype[0] == 0  # robot geoms never meet each other

@@ -10,7 +10,7 @@ import pytest
 import scipy.signal
 from mujoco import mjx
 
-from twirl_mjx.sim import a1
+from twirl_mjx.sim.robots import A1
 
 CONTROL_DT = 0.05
 STEPS = 40
@@ -54,11 +54,11 @@ CANDIDATES = (
 
 def build(physics: Physics) -> mujoco.MjModel:
     """The robot with every collision shape enabled, on a plane."""
-    spec = mujoco.MjSpec.from_file(str(a1.xml_path()))
+    spec = mujoco.MjSpec.from_file(str(A1.model()))
     spec.worldbody.add_geom(
         type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 0.05], contype=1, conaffinity=0, priority=1
     )
-    for shape in a1.CONTACT_GEOMS:
+    for shape in A1.contact_geoms:
         spec.geom(shape.name).conaffinity = 1
     spec.option.timestep = CONTROL_DT / physics.substeps
     spec.option.iterations = physics.iterations
@@ -74,9 +74,9 @@ def targets(amplitude: float) -> np.ndarray:
     low_pass = scipy.signal.butter(2, 0.4, output="sos")
     offset = scipy.signal.sosfilt(low_pass, action, axis=1)
     return np.clip(
-        a1.DEFAULT_POSE + a1.ACTION_HALF_RANGE * offset,
-        a1.JOINT_LIMITS[:, 0],
-        a1.JOINT_LIMITS[:, 1],
+        A1.default_pose + A1.action_half_range * offset,
+        A1.joint_limits[:, 0],
+        A1.joint_limits[:, 1],
     )
 
 
@@ -86,7 +86,7 @@ def simulate(physics: Physics, target: np.ndarray) -> np.ndarray:
     data = mujoco.MjData(model)
     poses = np.zeros((SEEDS, STEPS, 19))
     for seed in range(SEEDS):
-        mujoco.mj_resetDataKeyframe(model, data, model.key(a1.HOME_KEY).id)
+        mujoco.mj_resetDataKeyframe(model, data, model.key("home").id)
         data.qpos[2] += DROP
         for step in range(STEPS):
             data.ctrl[:] = target[seed, step]
@@ -107,7 +107,7 @@ def simulate_mjx(physics: Physics, target: np.ndarray) -> np.ndarray:
         data, _ = jax.lax.scan(substep, data.replace(ctrl=ctrl), length=physics.substeps)
         return data, data.qpos
 
-    home = jnp.asarray(host.key(a1.HOME_KEY).qpos, jnp.float32)
+    home = jnp.asarray(host.key("home").qpos, jnp.float32)
     start = mjx.make_data(host).replace(qpos=home.at[2].add(DROP))
     rollout = jax.jit(jax.vmap(lambda ctrl: jax.lax.scan(control_step, start, ctrl)[1]))
     return np.asarray(rollout(jnp.asarray(target, jnp.float32)), np.float64)

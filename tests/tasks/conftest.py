@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from twirl_mjx.sim import a1
 from twirl_mjx.sim.dynamics import Dynamics, make_dynamics
+from twirl_mjx.sim.robots import A1
 from twirl_mjx.sim.scene import build_scene
 from twirl_mjx.tasks import base
 from twirl_mjx.tasks.base import Outcome
@@ -148,7 +148,7 @@ def ground_distances(model: mujoco.MjModel, qpos: np.ndarray) -> dict[str, float
     floor = model.geom("floor").id
     return {
         shape.name: mujoco.mj_geomDistance(model, data, floor, model.geom(shape.name).id, 3.0, None)
-        for shape in a1.CONTACT_GEOMS
+        for shape in A1.contact_geoms
     }
 
 
@@ -162,7 +162,7 @@ def poses() -> dict[str, np.ndarray]:
         qpos = np.concatenate([[0.0, 0.0, 1.0], quat, joints])
         qpos[2] -= min(ground_distances(model, qpos).values()) + depth
         distances = ground_distances(model, qpos)
-        assert parts == {s.body for s in a1.CONTACT_GEOMS if distances[s.name] <= 0.0}, name
+        assert parts == {s.body for s in A1.contact_geoms if distances[s.name] <= 0.0}, name
         made[name] = qpos
     return made
 

@@ -8,7 +8,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from twirl_mjx.sim import a1, kinematics
+from twirl_mjx.sim import kinematics
+from twirl_mjx.sim.robots import A1
 from twirl_mjx.sim.scene import HURDLE_HEIGHT, HURDLE_LENGTH
 from twirl_mjx.tasks import bands
 
@@ -125,16 +126,16 @@ def test_no_pose_reaches_beyond_the_nearest_band() -> None:
         [
             np.zeros((4000, 3)),
             quat / np.linalg.norm(quat, axis=1, keepdims=True),
-            rng.uniform(a1.JOINT_LIMITS[:, 0], a1.JOINT_LIMITS[:, 1], (4000, 12)),
+            rng.uniform(A1.joint_limits[:, 0], A1.joint_limits[:, 1], (4000, 12)),
         ],
         axis=1,
     )
     # And both legs of a side stretched out fore and aft.
     qpos[0, 3:] = [1, 0, 0, 0, *np.tile([0, -np.pi / 2 + 0.458, -0.916], 4)]
     qpos[1, 3:] = [1, 0, 0, 0, *np.tile([0, np.pi / 2 + 0.458, -0.916], 4)]
-    ends = kinematics.forward(jnp.asarray(qpos, jnp.float32)).endpoints
-    reach = np.abs(np.asarray(ends[..., 0])).max(axis=-1) + a1.CONTACT_RADII
-    assert 0.5 < reach.max() < bands.REACH - HALF
+    ends = kinematics.forward(A1, jnp.asarray(qpos, jnp.float32)).endpoints
+    reach = np.abs(np.asarray(ends[..., 0])).max(axis=-1) + A1.contact_radii
+    assert 0.5 < reach.max() < bands.reach(A1) - HALF
 
 
 def test_crossing_window() -> None:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from twirl_mjx.sim import a1
+from twirl_mjx.sim.robots import A1
 from twirl_mjx.tasks.base import Outcome
 from twirl_mjx.tasks.biped import Biped, BipedOptions
 from twirl_mjx.tasks.goals import GoalOptions, draw_goal
@@ -62,7 +62,7 @@ def test_reward_recomputed_from_the_state(
 
 def raised(x: float, pitch_up: float = 90.0, z: float = 0.5) -> np.ndarray:
     half = np.deg2rad(-pitch_up) / 2
-    return np.concatenate([[x, 0, z, np.cos(half), 0, np.sin(half), 0], a1.DEFAULT_POSE])
+    return np.concatenate([[x, 0, z, np.cos(half), 0, np.sin(half), 0], A1.default_pose])
 
 
 def test_reward_by_hand(judge: Callable[..., Outcome]) -> None:

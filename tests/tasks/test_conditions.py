@@ -13,12 +13,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from twirl_mjx.worlds.vector import EnvState, VectorEnv
 
 from twirl_mjx.sim.dynamics import Dynamics, broadcast, make_dynamics
 from twirl_mjx.sim.ranges import NO_RANGES, Ranges, draw, parse_ranges
 from twirl_mjx.tasks import vector
 from twirl_mjx.tasks.observations import UPRIGHT, layout_noise, layout_slices
+from twirl_mjx.worlds.vector import EnvState, VectorEnv
 
 LIMIT = 400
 ACTIVE = {"obs_noise": 0.0, "push": 0.0, "push_interval": 5.0, "latency": 0.0}

@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from twirl_mjx.sim import a1
 from twirl_mjx.sim.dynamics import make_dynamics
+from twirl_mjx.sim.robots import A1
 from twirl_mjx.sim.scene import build_scene, terrain_height
 from twirl_mjx.tasks import base, rewards
 from twirl_mjx.tasks.hurdles import WEIGHTS, Hurdles, HurdlesOptions, HurdlesState, advance, watch
@@ -24,8 +24,8 @@ POSITIONS = (2.0, 4.0, 6.0)
 SUBSTEPS = 10
 
 
-def standing(x: float = 0.0, z: float = a1.HOME_HEIGHT) -> np.ndarray:
-    return np.concatenate([[x, 0.0, z, 1.0, 0.0, 0.0, 0.0], a1.DEFAULT_POSE])
+def standing(x: float = 0.0, z: float = A1.home_height) -> np.ndarray:
+    return np.concatenate([[x, 0.0, z, 1.0, 0.0, 0.0, 0.0], A1.default_pose])
 
 
 def flying(xs: np.ndarray, z: float = 0.6) -> np.ndarray:
@@ -140,7 +140,7 @@ def test_count_pays_always_and_event_pays_once() -> None:
 
 def test_a_step_over_a_hurdle_earns_no_clean_bonus() -> None:
     state = task_state()
-    for x, z in ((2.0, a1.HOME_HEIGHT - 0.01), (2.5, 0.6), (4.5, 0.6)):
+    for x, z in ((2.0, A1.home_height - 0.01), (2.5, 0.6), (4.5, 0.6)):
         # On the ground astride the first hurdle, then flying over the second.
         out = CLEAN(state, flying(np.full(SUBSTEPS, x), z))
         state = out.task
@@ -152,7 +152,7 @@ def test_a_touch_within_the_step_is_found() -> None:
     xs = np.linspace(1.5, 2.0, SUBSTEPS)
     trace = flying(xs)
     assert not JUDGE(task_state(), trace).terminated
-    trace[4, 2] = a1.HOME_HEIGHT  # feet on the ground for one substep, FR and FL at the hurdle
+    trace[4, 2] = A1.home_height  # feet on the ground for one substep, FR and FL at the hurdle
     trace[4, 0] = 2.0 - 0.183
     out = JUDGE(task_state(), trace)
     assert out.terminated
@@ -165,8 +165,8 @@ def test_a_touch_within_the_step_is_found() -> None:
 def test_how_near_a_foot_may_come() -> None:
     # Feet are 0.183 m before and behind the root, calves slant back and up from them.
     for gap, hit in ((-0.0005, True), (0.0005, False)):
-        above = standing(2.0 + 0.183, a1.HOME_HEIGHT + 0.01 + gap)
-        beside = standing(2.0 - 0.183 - 0.1 - 0.02 - gap, a1.HOME_HEIGHT - 0.01)
+        above = standing(2.0 + 0.183, A1.home_height + 0.01 + gap)
+        beside = standing(2.0 - 0.183 - 0.1 - 0.02 - gap, A1.home_height - 0.01)
         for pose in (above, beside):
             assert bool(WATCH(jnp.asarray(np.tile(pose, (SUBSTEPS, 1)), jnp.float32)).hit) is hit
 
@@ -175,7 +175,7 @@ def test_hind_feet_still_hit_a_hurdle_that_was_passed() -> None:
     pose = standing(2.41)
     pose[7:] = np.tile([0.0, 1.6, -1.2], 4)  # feet far back: 0.28 m behind their hips
     trace = np.tile(pose, (SUBSTEPS, 1))
-    trace[:, 2] = 0.2 * np.cos(1.6) + 0.2 * np.cos(0.4) + a1.FOOT_RADIUS
+    trace[:, 2] = 0.2 * np.cos(1.6) + 0.2 * np.cos(0.4) + A1.foot_radius
     out = JUDGE(task_state(passed=0), trace)
     assert int(out.task.passed) == 1
     assert out.metrics["hit_hurdle"]
@@ -196,7 +196,7 @@ def cross(land_at: float, take_off_at: float = 1.7) -> HurdlesState:
     for step in range(12, 30):
         xs = 0.1 * step + np.linspace(0.01, 0.1, SUBSTEPS)
         trace = np.stack(
-            [standing(x, a1.HOME_HEIGHT + (0.1 if take_off_at <= x < land_at else 0.0)) for x in xs]
+            [standing(x, A1.home_height + (0.1 if take_off_at <= x < land_at else 0.0)) for x in xs]
         )
         state = advance(state, WATCH(jnp.asarray(trace, jnp.float32)), xs[-1])
     return state

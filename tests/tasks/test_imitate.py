@@ -15,8 +15,8 @@ from scipy.spatial.transform import Rotation
 
 from twirl_mjx.motion.clip import Clip
 from twirl_mjx.motion.formats import write_clip
-from twirl_mjx.sim import a1
 from twirl_mjx.sim.dynamics import make_dynamics
+from twirl_mjx.sim.robots import A1
 from twirl_mjx.sim.scene import CONTROL_DT, build_scene
 from twirl_mjx.tasks import base
 from twirl_mjx.tasks.imitate import (
@@ -41,10 +41,10 @@ def synthetic_clip(yaw: float = 0.0, **changes: Any) -> Clip:
     phase = np.linspace(0.0, 1.0, 49)
     swing = np.sin(2 * np.pi * phase)
     x = SPEED * CYCLE * phase
-    z = a1.HOME_HEIGHT + 0.3 * np.sin(np.pi * phase) ** 2
+    z = A1.home_height + 0.3 * np.sin(np.pi * phase) ** 2
     turn = Rotation.from_euler("z", yaw)
     pitch = Rotation.from_euler("y", 0.2 * swing[:, None])
-    joints = a1.DEFAULT_POSE + 0.2 * swing[:, None] * np.tile([0.3, 1.0, -1.0], 4)
+    joints = A1.default_pose + 0.2 * swing[:, None] * np.tile([0.3, 1.0, -1.0], 4)
     clip = Clip(
         root_pos=turn.apply(np.stack([x, 0.0 * x, z], axis=1)) + np.array([0.4, -0.3, 0.0]),
         root_quat=(turn * pitch).as_quat(scalar_first=True),
@@ -226,7 +226,7 @@ def test_a_share_of_the_episodes_starts_at_rest(options: ImitateOptions) -> None
     rest = np.all(np.asarray(start.qvel) == 0.0, axis=1)
     assert 70 < rest.sum() < 130  # 100 +- 4 standard deviations
     assert np.all((np.asarray(start.memory.start_time) == task.observer.standing_time)[rest])
-    joints = np.asarray(start.qpos)[rest, 7:] - a1.DEFAULT_POSE
+    joints = np.asarray(start.qpos)[rest, 7:] - A1.default_pose
     assert np.abs(joints).max() <= base.START_NOISE + 1e-6
     np.testing.assert_allclose(np.asarray(start.qvel)[~rest, 0], SPEED, rtol=1e-4)
 
@@ -269,7 +269,7 @@ def test_early_termination(harness: Harness) -> None:
 
     assert outcome(squat) == {"lost": False, "fall": False}
 
-    assert outcome(lambda pose: pose.__setitem__(2, a1.HOME_HEIGHT - 0.01)) == {
+    assert outcome(lambda pose: pose.__setitem__(2, A1.home_height - 0.01)) == {
         "lost": False,
         "fall": False,
     }
@@ -283,7 +283,7 @@ def test_leaps_are_whole_cycles(harness: Harness) -> None:
         assert float(harness.judge(late, qpos, qvel).metrics["leaps"]) == leaps
     high = harness.judge(harness.at(0.6), *harness.reference(harness.at(0.6)))
     assert high.metrics["airborne"]
-    assert not harness.judge(memory, qpos.at[2].set(a1.HOME_HEIGHT), qvel).metrics["airborne"]
+    assert not harness.judge(memory, qpos.at[2].set(A1.home_height), qvel).metrics["airborne"]
 
 
 def test_a_flight_counts_once_and_only_when_long() -> None:

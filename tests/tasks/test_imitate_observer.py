@@ -12,19 +12,20 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from twirl_mjx.motion.clip import Clip, headings
-from twirl_mjx.sim import a1
+from twirl_mjx.sim.robots import A1
 from twirl_mjx.sim.scene import CONTROL_DT
 from twirl_mjx.tasks.imitate import (
-    LAYOUT,
     TARGET_STEPS,
     ImitateMemory,
     ImitateObserver,
     facing_x,
     load_clip,
+    make_layout,
     standing_time,
 )
 from twirl_mjx.tasks.observations import layout_size, layout_slices
 
+LAYOUT = make_layout(A1)
 CYCLE = 1.2
 SPEED = 1.75
 CYCLE_STEPS = 24
@@ -35,10 +36,10 @@ def synthetic_clip(yaw: float = 0.0, **changes: Any) -> Clip:
     phase = np.linspace(0.0, 1.0, 49)
     swing = np.sin(2 * np.pi * phase)
     x = SPEED * CYCLE * phase
-    z = a1.HOME_HEIGHT + 0.3 * np.sin(np.pi * phase) ** 2
+    z = A1.home_height + 0.3 * np.sin(np.pi * phase) ** 2
     turn = Rotation.from_euler("z", yaw)
     pitch = Rotation.from_euler("y", 0.2 * swing[:, None])
-    joints = a1.DEFAULT_POSE + 0.2 * swing[:, None] * np.tile([0.3, 1.0, -1.0], 4)
+    joints = A1.default_pose + 0.2 * swing[:, None] * np.tile([0.3, 1.0, -1.0], 4)
     clip = Clip(
         root_pos=turn.apply(np.stack([x, 0.0 * x, z], axis=1)) + np.array([0.4, -0.3, 0.0]),
         root_quat=(turn * pitch).as_quat(scalar_first=True),
@@ -99,10 +100,10 @@ def test_target_poses_of_a_robot_on_the_reference(harness: Harness) -> None:
         half = 0.1 * swing
         np.testing.assert_allclose(quat, [np.cos(half), 0, np.sin(half), 0], atol=2e-4)
         joints = obs[slices[f"target_joint_pos[+{step}]"]]
-        want = a1.DEFAULT_POSE + 0.2 * swing * np.tile([0.3, 1.0, -1.0], 4)
+        want = A1.default_pose + 0.2 * swing * np.tile([0.3, 1.0, -1.0], 4)
         np.testing.assert_allclose(joints, want, atol=1e-3)
     for i in (-2, -1, 0):
-        np.testing.assert_allclose(obs[slices[f"joint_pos[{i}]"]], a1.DEFAULT_POSE, atol=1e-6)
+        np.testing.assert_allclose(obs[slices[f"joint_pos[{i}]"]], A1.default_pose, atol=1e-6)
         np.testing.assert_allclose(obs[slices[f"base_quat_h[{i}]"]], [1, 0, 0, 0], atol=1e-6)
 
 
@@ -130,7 +131,7 @@ def test_targets_are_seen_from_the_robots_heading(harness: Harness) -> None:
 def test_the_observer_serves_a_foreign_task(harness: Harness) -> None:
     """What a learned source does with it in ``hurdles``: init, push, observe, of many worlds."""
     observer = harness.observer
-    standing = np.concatenate([[0.0, 0.0, a1.HOME_HEIGHT, 1.0, 0.0, 0.0, 0.0], a1.DEFAULT_POSE])
+    standing = np.concatenate([[0.0, 0.0, A1.home_height, 1.0, 0.0, 0.0, 0.0], A1.default_pose])
     qpos = jnp.asarray(np.stack([standing, standing]), jnp.float32)
     qpos = qpos.at[1, :2].set(jnp.array([3.0, -4.0]))
     qvel = jnp.zeros((2, 18))

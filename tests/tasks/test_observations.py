@@ -10,11 +10,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from twirl_mjx.deploy import reference
+from twirl_mjx.sim.robots import A1
 from twirl_mjx.tasks import observations
+
+UPRIGHT = observations.proprioceptive(A1, axes=True)
 
 
 @pytest.mark.parametrize(
-    ("layout", "size"), [(observations.PROPRIOCEPTIVE, 95), (observations.UPRIGHT, 101)]
+    ("layout", "size"), [(observations.proprioceptive(A1, axes=False), 95), (UPRIGHT, 101)]
 )
 def test_layout_covers_the_observation(layout: tuple[observations.Entry, ...], size: int) -> None:
     slices = observations.layout_slices(layout)
@@ -26,7 +29,7 @@ def test_layout_covers_the_observation(layout: tuple[observations.Entry, ...], s
 
 
 def test_where_the_entries_are() -> None:
-    slices = observations.layout_slices(observations.UPRIGHT)
+    slices = observations.layout_slices(UPRIGHT)
     assert slices["goal_displacement_w"] == slice(0, 2)
     assert slices["roll_pitch[-2]"] == slice(2, 4)  # the oldest frame comes first
     assert slices["previous_action[-2]"] == slice(21, 33)

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from twirl_mjx.sim import a1
 from twirl_mjx.sim.dynamics import make_dynamics
+from twirl_mjx.sim.robots import A1
 from twirl_mjx.sim.scene import build_scene
 from twirl_mjx.tasks.base import Outcome
 from twirl_mjx.tasks.stand import Stand, StandOptions
@@ -72,8 +72,8 @@ def test_reward_recomputed_from_the_state(
 
 def test_reward_by_hand(judge: Callable[..., Outcome]) -> None:
     """Level at 0.5 m, then nose straight up at 0.5 m with hanging front legs."""
-    level = np.concatenate([[0, 0, 0.5, 1, 0, 0, 0], a1.DEFAULT_POSE])
-    up = np.concatenate([[0, 0, 0.5, 0.5**0.5, 0, -(0.5**0.5), 0], a1.DEFAULT_POSE])
+    level = np.concatenate([[0, 0, 0.5, 1, 0, 0, 0], A1.default_pose])
+    up = np.concatenate([[0, 0, 0.5, 0.5**0.5, 0, -(0.5**0.5), 0], A1.default_pose])
     root = judge(Stand(), [level, up])
     np.testing.assert_allclose(root.reward, [0.25 + 0.6487213, 1.0 + 0.6487213], atol=1e-5)
     # Front feet: level 0.5 - 0.4 cos 0.9 = 0.251356 m; up: 0.183 m along the nose, the leg level.
@@ -88,7 +88,7 @@ def test_standing_needs_cosine_and_both_front_feet(judge: Callable[..., Outcome]
 
     def pose(pitch: float, z: float, lower_leg: tuple[float, float] = (0.9, -1.8)) -> np.ndarray:
         half = np.deg2rad(-pitch) / 2
-        joints = np.concatenate([[0.0, *lower_leg], a1.DEFAULT_POSE[3:]])
+        joints = np.concatenate([[0.0, *lower_leg], A1.default_pose[3:]])
         return np.concatenate([[0, 0, z, np.cos(half), 0, np.sin(half), 0], joints])
 
     reach = (-1.047, -0.92)  # the front right leg stretched forwards, which is up
@@ -146,7 +146,7 @@ def lowest(model: mujoco.MjModel, qpos: np.ndarray) -> tuple[str, float]:
     floor = model.geom("floor").id
     distance, body = min(
         (mujoco.mj_geomDistance(model, data, floor, model.geom(s.name).id, 3.0, None), s.body)
-        for s in a1.CONTACT_GEOMS
+        for s in A1.contact_geoms
     )
     return body, distance
 
@@ -156,7 +156,7 @@ def test_starts_on_four_feet(model: mujoco.MjModel) -> None:
     qpos = draw_starts(StandOptions(), 500)
     np.testing.assert_array_equal(qpos[:, :2], 0.0)
     np.testing.assert_array_equal(qpos[:, 3:7], np.tile([1.0, 0, 0, 0], (500, 1)))
-    noise = qpos[:, 7:] - a1.DEFAULT_POSE
+    noise = qpos[:, 7:] - A1.default_pose
     assert np.abs(noise).max() < 0.0500001
     np.testing.assert_allclose(noise.std(axis=0), 0.1 / 12**0.5, rtol=0.1)
     for start in qpos[:50]:
@@ -172,7 +172,7 @@ def test_risen_starts(model: mujoco.MjModel) -> None:
     assert 0.0 <= pitch.min() < 2.0
     assert 81.0 < pitch.max() <= 83.01
     assert pitch.mean() == pytest.approx(41.5, abs=3.0)
-    low, high = a1.JOINT_LIMITS.T
+    low, high = A1.joint_limits.T
     assert (qpos[:, 7:] > low).all()
     assert (qpos[:, 7:] < high).all()
     for start in qpos[:100]:

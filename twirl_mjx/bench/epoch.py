@@ -92,7 +92,7 @@ def make_parts(config: TrainConfig, env: VectorEnv, state: TrainState) -> dict[s
 def _world_parts(env: VectorEnv, state: TrainState) -> dict[str, Any]:
     """Return the parts that move the worlds and store what happened."""
     shape = (env.num_envs, env.action_size)
-    command = jax.jit(jax.vmap(actuation.motor_command))(
+    command = jax.jit(jax.vmap(functools.partial(actuation.motor_command, env.scene.robot)))(
         state.env.world.motors, state.env.data.ctrl, state.env.world.dynamics
     )
     result = jax.jit(env.step)(state.env, jnp.zeros(shape))

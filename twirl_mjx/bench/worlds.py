@@ -86,7 +86,7 @@ def random_steps(env: VectorEnv, state: tuple[EnvState, jax.Array]) -> Any:
     """Take ``STEPS`` control steps with uniformly random actions.
 
     Returns:
-        The new state, and the joint targets [STEPS, N, 12] in rad.
+        The new state, and the joint targets [STEPS, N, A] in rad.
     """
 
     def step(carry: tuple[EnvState, jax.Array], _: None) -> tuple[Any, jax.Array]:
@@ -101,7 +101,7 @@ def random_steps(env: VectorEnv, state: tuple[EnvState, jax.Array]) -> Any:
 
 
 def bare_mjx(env: VectorEnv, data: mjx.Data, targets: jax.Array) -> Callable[[], object]:
-    """Compile ``mjx.step`` of the env's model over joint targets [STEPS, N, 12]."""
+    """Compile ``mjx.step`` of the env's model over joint targets [STEPS, N, A]."""
     step = jax.vmap(functools.partial(mjx.step, env.scene.mjx_model))
     substeps = env.scene.options.n_substeps
 

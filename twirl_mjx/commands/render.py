@@ -80,16 +80,17 @@ def film(config: WorldConfig, options: RenderOptions, stem: Path) -> Path:
     from twirl_mjx.deploy.render import render_episode
     from twirl_mjx.evaluation.record import record_episode, scene_model
     from twirl_mjx.policies.resolve import resolve_policy
-    from twirl_mjx.sim.scene import CONTROL_DT
+    from twirl_mjx.sim.robots import ROBOTS
 
     found = resolve_policy(options.policy, config)
-    steps = min(config.episode_length, round(options.seconds / CONTROL_DT))
+    control_dt = ROBOTS.get(config.robot).control_dt
+    steps = min(config.episode_length, round(options.seconds / control_dt))
     recording = record_episode(config, found.policy, seed=options.seed, steps=steps)
     video, strip = render_episode(
         scene_model(config, recording),
         recording.qpos,
         stem,
-        frame_dt=CONTROL_DT,
+        frame_dt=control_dt,
         panels=options.panels,
         goals=recording.goals if config.task_type.shows_goal else None,
         captions=captions(config, recording),
@@ -101,17 +102,15 @@ def film(config: WorldConfig, options: RenderOptions, stem: Path) -> Path:
 def captions(config: WorldConfig, recording: Recording) -> list[list[str]]:
     """Return the text lines of every frame."""
     from twirl_mjx.sim import look
-    from twirl_mjx.sim.dynamics import make_dynamics
-    from twirl_mjx.sim.scene import CONTROL_DT
 
     total = np.cumsum(recording.reward)
-    shift = look.describe(
-        config.shift, make_dynamics(config.shift, config.shift_strength), recording.leg_strength
-    )
+    dynamics = config.make_dynamics()
+    shift = look.describe(config.shift, recording.robot, dynamics, recording.leg_strength)
+    control_dt = recording.robot.control_dt
     title = f"{config.task}, {shift}" if shift else config.task
     return [
         [
-            f"{title}  {CONTROL_DT * (t + 1):5.2f} s",
+            f"{title}  {control_dt * (t + 1):5.2f} s",
             f"return {total[t]:.0f}  "
             + "  ".join(f"{k} {recording.metrics[k][t]:.2f}" for k in config.task_type.caption),
         ]

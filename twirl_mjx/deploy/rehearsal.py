@@ -34,7 +34,6 @@ __all__ = ["IDEAL", "Episode", "Rehearsal", "RehearsalConfig", "rehearse"]
 BANDS = 24
 """Hurdle bands laid out: more than 20 s at 2 m/s can reach."""
 FRONT_FEET = ("FR_foot", "FL_foot")
-FOOT_RADIUS = 0.02
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,13 +45,13 @@ class Episode:
     cause: str
     """Why it ended: ``time``, ``fall``, ``hurdle`` or ``diverged``."""
     qpos: np.ndarray
-    """[T + 1, 19] true state at every control step, for rendering."""
+    """[T + 1, 7 + J] true state at every control step, for rendering."""
     goals: np.ndarray
     """[T + 1, 2] m, goal at every control step, world frame."""
     observations: np.ndarray
     """[T, O] what the policy was given."""
     actions: np.ndarray
-    """[T, 12] what it answered."""
+    """[T, A] what it answered."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -80,10 +79,10 @@ class Rehearsal:
 class Drive:
     """Totals over the physics steps of an episode."""
 
-    peak: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(12))
-    """[12] largest torque, N m."""
-    work: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(12))
-    """[12] integral of |torque * speed|, J."""
+    peak: np.ndarray
+    """[J] largest torque, N m."""
+    work: np.ndarray
+    """[J] integral of |torque * speed|, J."""
 
 
 def draw_goal(config: RehearsalConfig, rng: np.random.Generator) -> np.ndarray:
@@ -114,7 +113,7 @@ def advance(
         model: the physics.
         data: its state, changed in place.
         config: motors.
-        targets: (physics step from which it holds, joint target [12] rad), oldest first; used-up
+        targets: (physics step from which it holds, joint target [J] rad), oldest first; used-up
             entries are removed, the one in force stays in front.
         contacts: contact rules.
         drive: totals, changed in place.
@@ -122,7 +121,7 @@ def advance(
     Returns:
         The cause if the episode ended.
     """
-    joint_pos, joint_vel = data.qpos[7:19], data.qvel[6:18]
+    joint_pos, joint_vel = data.qpos[7:], data.qvel[6:]
     first = round(data.time / config.sim_dt)
     for now in range(first, first + config.n_substeps):
         while len(targets) > 1 and targets[1][0] <= now:
@@ -146,7 +145,7 @@ def run_episode(
     """Rehearse one episode from rest on four feet at the origin, facing +x.
 
     Args:
-        policy: ``act(obs [O]) -> action [12]``; ``reset()`` is called first when it has one.
+        policy: ``act(obs [O]) -> action [A]``; ``reset()`` is called first when it has one.
         task: one of ``reference.TASKS``.
         config: conditions.
         rng: draws goal, hurdles and noise.
@@ -159,13 +158,15 @@ def run_episode(
     data = mujoco.MjData(model)
     mujoco.mj_resetDataKeyframe(model, data, model.key("home").id)
     mujoco.mj_forward(model, data)
-    sensors, contacts, drive = Sensors(config, rng), Contacts(model, task), Drive()
+    sensors, contacts = Sensors(config, rng), Contacts(model, task)
+    drive = Drive(np.zeros(model.nu), np.zeros(model.nu))
     score = Score(task, hurdles, config.height_of)
     score.start(data.qpos[:3], score.goal(drawn))
     reading = sensors.read(data)
-    observer, command = Observer(task, reading), CommandFilter(data.qpos[7:19])
-    targets = deque([(0, data.qpos[7:19].copy())])
+    observer, command = Observer(task, reading), CommandFilter(data.qpos[7:])
+    targets = deque([(0, data.qpos[7:].copy())])
     feet = [model.geom(name).id for name in FRONT_FEET]
+    radii = model.geom_size[feet, 0]
     qpos, goals, observations, actions = [data.qpos.copy()], [score.goal(drawn)], [], []
     cause, step = None, 0
     while cause is None and step < round(config.episode_s * CONTROL_HZ):
@@ -176,7 +177,7 @@ def run_episode(
         targets.append((start, command(action)))
         cause = advance(model, data, config, targets, contacts, drive)
         if cause != "diverged":
-            score.step(data.qpos, data.qvel, data.geom_xpos[feet, 2] - FOOT_RADIUS, goal)
+            score.step(data.qpos, data.qvel, data.geom_xpos[feet, 2] - radii, goal)
             reading = sensors.read(data)
             observer.push(reading, action)
             qpos.append(data.qpos.copy())

@@ -114,7 +114,7 @@ class SceneRenderer:
         """Draw one state.
 
         Args:
-            qpos: [19] MuJoCo layout.
+            qpos: [7 + J] MuJoCo layout.
             view: camera.
             look_at: [3] m, world point at the centre of the picture.
             goal: [2] or [3] m, world position of a goal marker; ``None`` for none.
@@ -178,7 +178,7 @@ def look_at_path(qpos: np.ndarray, view: CameraView, frame_dt: float) -> np.ndar
     A first-order low-pass is run forwards and backwards, so the camera does not lag.
 
     Args:
-        qpos: [T, 19].
+        qpos: [T, 7 + J].
         view: camera.
         frame_dt: time between frames, s.
     """

@@ -13,6 +13,7 @@ import numpy as np
 from twirl_mjx.sim import look
 from twirl_mjx.sim.dynamics import get_shift
 from twirl_mjx.sim.engine import world_model
+from twirl_mjx.sim.robot import NUM_LEGS, Robot
 from twirl_mjx.sim.scene import Bands, build_scene
 from twirl_mjx.tasks.base import ground_at
 from twirl_mjx.types import SourcePolicy
@@ -28,7 +29,7 @@ class Recording:
     """One episode of one world."""
 
     qpos: np.ndarray
-    """[T, 19] at the end of every control step; the last state before the episode ended."""
+    """[T, 7 + J] at the end of every control step; the last state before the episode ended."""
     goals: np.ndarray
     """[T, 3] m, on the ground."""
     reward: np.ndarray
@@ -38,7 +39,9 @@ class Recording:
     hurdles: tuple[float, ...]
     """x of the hurdle bands up to just beyond the way gone, m; empty in tasks without."""
     leg_strength: np.ndarray
-    """[4] in [0, 1] of the episode, order FR FL RR RL."""
+    """[4] in [0, 1] of the episode, order ``robot.legs``."""
+    robot: Robot
+    """Who moves."""
 
 
 def record_episode(
@@ -57,7 +60,7 @@ def record_episode(
     state = jax.jit(env.reset)(reset_key)
     memory = policy.init(state)
     hurdles = env.task.bands(jax.tree.map(lambda leaf: leaf[0], state.world.task))
-    strength = np.asarray(state.world.motors.strength[0]).reshape(4, 3).min(axis=1)
+    strength = np.asarray(state.world.motors.strength[0]).reshape(NUM_LEGS, -1).min(axis=1)
 
     @jax.jit
     def step(state: Any, memory: Any, key: jax.Array) -> tuple[Any, Any]:
@@ -86,7 +89,8 @@ def record_episode(
     qpos, goals, reward = (np.stack(column) for column in zip(*rows, strict=True))
     stacked = jax.tree.map(lambda *x: np.stack(x), *metrics)
     reached = hurdles[hurdles < qpos[:, 0].max() + BANDS_AHEAD]
-    return Recording(qpos, goals, reward, stacked, tuple(map(float, reached)), strength)
+    hurdles_reached = tuple(map(float, reached))
+    return Recording(qpos, goals, reward, stacked, hurdles_reached, strength, env.scene.robot)
 
 
 def scene_model(config: WorldConfig, recording: Recording) -> mujoco.MjModel:
@@ -98,7 +102,7 @@ def scene_model(config: WorldConfig, recording: Recording) -> mujoco.MjModel:
         incline=float(dynamics.incline),
         bump_height=float(dynamics.bump_height),
     )
-    scene = build_scene(get_shift(config.shift).scene, bands=bands)
+    scene = build_scene(get_shift(config.shift).scene, robot=recording.robot, bands=bands)
     model = world_model(scene, dynamics)
-    look.paint(model, dynamics, recording.leg_strength)
+    look.paint(model, recording.robot, dynamics, recording.leg_strength)
     return model

@@ -16,7 +16,7 @@ from twirl_mjx.types import SourcePolicy
 from twirl_mjx.worlds.vector import EnvState, VectorEnv
 
 ActFn = Callable[[Any, Any, EnvState, jax.Array], tuple[jax.Array, Any]]
-"""(parameters, memory, state, key) -> (actions [N, 12], memory)."""
+"""(parameters, memory, state, key) -> (actions [N, A], memory)."""
 
 
 def first_episodes(

@@ -1,9 +1,9 @@
-"""Reference motions: frames of the A1's configuration, and sampling them at any time.
+"""Reference motions: frames of a robot's configuration, and sampling them at any time.
 
 A clip lasts ``(F - 1) * frame_duration``: its last frame is the first frame of the next cycle. A
 wrapping clip goes on from where the cycle before it ended, as in Peng et al. 2020 ("Learning Agile
 Robotic Locomotion Skills by Imitating Animals"): every cycle is the first one moved by a planar
-rigid motion. Joint order is FR FL RR RL x hip thigh calf, quaternions are wxyz, body to world.
+rigid motion. Joints are in the order of the robot, quaternions are wxyz, body to world.
 """
 
 from __future__ import annotations
@@ -18,6 +18,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from twirl_mjx.sim import frames
+from twirl_mjx.sim.robot import Robot
+from twirl_mjx.sim.robots import A1
 
 LoopMode = Literal["wrap", "clamp"]
 QUAT_TOLERANCE = 0.01
@@ -32,13 +34,13 @@ class ClipArrays(flax.struct.PyTreeNode):
     root_quat: jax.Array
     """[F, 4] wxyz; neighbouring frames lie in the same hemisphere."""
     joint_pos: jax.Array
-    """[F, 12] rad."""
+    """[F, J] rad."""
     root_vel: jax.Array
     """[F, 3] m/s, world frame."""
     root_ang_vel: jax.Array
     """[F, 3] rad/s, body frame."""
     joint_vel: jax.Array
-    """[F, 12] rad/s."""
+    """[F, J] rad/s."""
     frame_duration: jax.Array
     """Scalar, s."""
     cycle_shift: jax.Array
@@ -54,14 +56,14 @@ class ClipArrays(flax.struct.PyTreeNode):
 
 @dataclass(frozen=True, eq=False)
 class Clip:
-    """A reference motion of the A1 (numpy, float64)."""
+    """A reference motion of a robot (numpy, float64)."""
 
     root_pos: np.ndarray
     """[F, 3] m, trunk origin in the world frame."""
     root_quat: np.ndarray
     """[F, 4] unit quaternions wxyz, trunk to world."""
     joint_pos: np.ndarray
-    """[F, 12] rad, FR FL RR RL x hip thigh calf."""
+    """[F, J] rad, in the order of the robot."""
     frame_duration: float
     """s between frames."""
     loop: LoopMode = "wrap"
@@ -72,6 +74,8 @@ class Clip:
     """Whether a new cycle starts with the heading with which the last one ended."""
     name: str = "clip"
     """For messages and figures."""
+    robot: Robot = A1
+    """Whose motion it is."""
 
     def __post_init__(self) -> None:
         """Check shapes and values, and normalise the quaternions.
@@ -79,7 +83,8 @@ class Clip:
         Raises:
             ValueError: the message names the clip, the frame and the value at fault.
         """
-        for field, width in (("root_pos", 3), ("root_quat", 4), ("joint_pos", 12)):
+        joints = self.robot.num_joints
+        for field, width in (("root_pos", 3), ("root_quat", 4), ("joint_pos", joints)):
             array = np.array(getattr(self, field), np.float64)
             if array.ndim != 2 or array.shape[1] != width:
                 raise ValueError(f"{self.name}: {field} has shape {array.shape}, need [F, {width}]")
@@ -131,7 +136,7 @@ class Clip:
 
     @property
     def qpos(self) -> np.ndarray:
-        """[F, 19] MuJoCo configurations of the frames."""
+        """[F, 7 + J] MuJoCo configurations of the frames."""
         return np.concatenate([self.root_pos, self.root_quat, self.joint_pos], axis=1)
 
     def to_arrays(self) -> ClipArrays:
@@ -178,7 +183,7 @@ def frame_velocities(clip: Clip) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
     Returns:
         Linear velocity [F, 3] m/s (world), angular velocity [F, 3] rad/s (body) and joint
-        velocity [F, 12] rad/s.
+        velocity [F, J] rad/s.
     """
     dt = clip.frame_duration
     rotation = Rotation.from_quat(clip.root_quat, scalar_first=True)
@@ -253,8 +258,8 @@ def sample(clip: ClipArrays, time: jax.Array | float) -> tuple[jax.Array, jax.Ar
         time: Scalar, s; 0 is the first frame. Any sign.
 
     Returns:
-        qpos [19] and qvel [18] in MuJoCo's layout (linear velocity in the world frame, angular
-        velocity in the body frame).
+        qpos [7 + J] and qvel [6 + J] in MuJoCo's layout (linear velocity in the world frame,
+        angular velocity in the body frame).
     """
     time = jnp.asarray(time, clip.root_pos.dtype)
     duration = clip.cycle_duration
@@ -284,7 +289,7 @@ def sample(clip: ClipArrays, time: jax.Array | float) -> tuple[jax.Array, jax.Ar
 
 
 def configurations(clip: Clip, times: np.ndarray) -> np.ndarray:
-    """Return qpos [T, 19] at ``times`` [T] s: the positions of ``sample``, in numpy (float64)."""
+    """Return qpos [T, 7 + J] at ``times`` [T] s: the positions of ``sample``, as float64."""
     wraps = clip.loop == "wrap"
     cycle = np.floor(times / clip.cycle_duration) if wraps else np.zeros(len(times))
     inside = np.clip(times - cycle * clip.cycle_duration, 0.0, clip.cycle_duration)

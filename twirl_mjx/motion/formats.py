@@ -4,13 +4,14 @@ Both are a JSON object with ``LoopMode`` ("Wrap" or "Clamp"), ``FrameDuration`` 
 ``EnableCycleOffsetPosition``, ``EnableCycleOffsetRotation`` and ``Frames``. They differ in the
 numbers of a frame; quaternions are x y z w in both, joints FR FL RR RL x hip thigh calf:
 
-* ``peng`` (Peng et al. 2020), 19 numbers: root position, root quaternion, 12 joint angles.
-* ``amp``, 61 numbers: the 19 above, then toe positions (12), linear velocity (3), angular velocity
-  (3), joint velocities (12) and toe velocities (12). Everything after the first 19 follows from
-  them; it is recomputed on reading and writing. Toes are written in the world frame, as in the
-  A1 files this was checked with.
+* ``peng`` (Peng et al. 2020): root position, root quaternion, joint angles.
+* ``amp``: the same, then toe positions, linear velocity (3), angular velocity (3), joint velocities
+  and toe velocities, as many of each as there are joints. All of this follows from the former: it
+  is recomputed on reading and writing. Toes are written in the world frame, as in the A1 files
+  this was checked with.
 
-The joint order cannot be told from a file: for another one pass ``legs`` to ``read_clip``.
+The joint order cannot be told from a file: for another one pass ``legs`` to ``read_clip``. A clip
+has the joints in the order of its robot.
 """
 
 from __future__ import annotations
@@ -26,20 +27,28 @@ from scipy.spatial.transform import Rotation
 
 from twirl_mjx import files
 from twirl_mjx.motion.clip import Clip, LoopMode, frame_velocities
-from twirl_mjx.sim import a1, kinematics
+from twirl_mjx.sim import kinematics
+from twirl_mjx.sim.robot import LEG_SIZE, NUM_LEGS, ROOT_SIZE, Robot
+from twirl_mjx.sim.robots import A1
 
 Layout = Literal["peng", "amp"]
-FRAME_SIZES: dict[str, int] = {"peng": 19, "amp": 61}
+NUM_JOINTS = NUM_LEGS * LEG_SIZE
+POSE_SIZE = ROOT_SIZE + NUM_JOINTS
+"""Numbers of a configuration."""
+FRAME_SIZES: dict[str, int] = {"peng": POSE_SIZE, "amp": POSE_SIZE + 3 * NUM_JOINTS + 6}
 """Numbers in a frame."""
+CORNERS = ("FR", "FL", "RR", "RL")
+"""Legs of a file in their order: front right, front left, hind right, hind left."""
 LOOP_MODES: dict[str, LoopMode] = {"Wrap": "wrap", "Clamp": "clamp"}
 
 
-def read_clip(path: str | Path, legs: Sequence[str] = a1.LEGS) -> Clip:
+def read_clip(path: str | Path, legs: Sequence[str] = CORNERS, robot: Robot = A1) -> Clip:
     """Read a clip of either layout; the frame size tells which.
 
     Args:
         path: The file. Keys other than those of the layout (``MotionWeight``, say) are ignored.
         legs: Order of the legs in the file, a permutation of FR FL RR RL.
+        robot: Whose motion it is.
 
     Returns:
         The motion, named after the file.
@@ -49,21 +58,24 @@ def read_clip(path: str | Path, legs: Sequence[str] = a1.LEGS) -> Clip:
         ValueError: the file is malformed; the message names the file and the line, key or frame.
     """
     path = Path(path)
-    if sorted(legs) != sorted(a1.LEGS):
-        raise ValueError(f"legs {list(legs)} must be a permutation of {', '.join(a1.LEGS)}")
+    if sorted(legs) != sorted(CORNERS):
+        raise ValueError(f"legs {list(legs)} must be a permutation of {', '.join(CORNERS)}")
     data = _parse(path)
     frames = _frames(path, data)
-    joints = frames[:, 7:19].reshape(-1, 4, 3)[:, [list(legs).index(leg) for leg in a1.LEGS]]
+    angles = frames[:, ROOT_SIZE:POSE_SIZE].reshape(-1, NUM_LEGS, LEG_SIZE)
+    joints = np.zeros_like(angles)
+    joints[:, list(robot.corners)] = angles[:, [list(legs).index(leg) for leg in CORNERS]]
     try:
         return Clip(
             root_pos=frames[:, :3],
             root_quat=frames[:, [6, 3, 4, 5]],
-            joint_pos=joints.reshape(-1, a1.NUM_JOINTS),
+            joint_pos=joints.reshape(-1, NUM_JOINTS),
             frame_duration=_duration(path, data),
             loop=_loop(path, data),
             cycle_offset_position=_flag(path, data, "EnableCycleOffsetPosition"),
             cycle_offset_rotation=_flag(path, data, "EnableCycleOffsetRotation"),
             name=path.stem,
+            robot=robot,
         )
     except ValueError as error:
         raise error if str(path) in str(error) else ValueError(f"{path}: {error}") from error
@@ -108,7 +120,7 @@ def _is_number(value: Any) -> bool:
 
 
 def _frames(path: Path, data: dict[str, Any]) -> np.ndarray:
-    """Return the frames [F, 19 or 61], every number checked."""
+    """Return the frames [F, 7 + J or 13 + 4 J], every number checked."""
     frames = _value(path, data, "Frames")
     if not isinstance(frames, list) or len(frames) < 2:
         raise ValueError(f"{path}: key Frames must be a list of at least 2 frames")
@@ -139,9 +151,10 @@ def write_clip(clip: Clip, path: str | Path, layout: Layout = "peng") -> None:
     """
     if layout not in FRAME_SIZES:
         raise ValueError(f"unknown clip layout {layout!r}: choose {' or '.join(FRAME_SIZES)}")
-    rows = np.concatenate([clip.root_pos, clip.root_quat[:, [1, 2, 3, 0]], clip.joint_pos], axis=1)
+    columns = [clip.root_pos, clip.root_quat[:, [1, 2, 3, 0]], _by_corner(clip, clip.joint_pos)]
     if layout == "amp":
-        rows = np.concatenate([rows, _derived(clip)], axis=1)
+        columns += _derived(clip)
+    rows = np.concatenate(columns, axis=1)
     head = {
         "LoopMode": {mode: name for name, mode in LOOP_MODES.items()}[clip.loop],
         "FrameDuration": clip.frame_duration,
@@ -155,26 +168,30 @@ def write_clip(clip: Clip, path: str | Path, layout: Layout = "peng") -> None:
     files.write_text(path, text)
 
 
-def _derived(clip: Clip) -> np.ndarray:
-    """Return what the AMP layout adds to a frame: [F, 42]."""
+def _by_corner(clip: Clip, values: np.ndarray) -> np.ndarray:
+    """Return three numbers a leg, [F, 4, 3] or [F, J], as [F, J] in the files' order of legs."""
+    count = clip.num_frames
+    return values.reshape(count, NUM_LEGS, LEG_SIZE)[:, list(clip.robot.corners)].reshape(count, -1)
+
+
+def _derived(clip: Clip) -> list[np.ndarray]:
+    """Return what the AMP layout adds to a frame, each [F, K]."""
     rotation = Rotation.from_quat(clip.root_quat, scalar_first=True)
     root_vel, root_ang_vel, joint_vel = frame_velocities(clip)
     arms = np.einsum("fij,flj->fli", rotation.as_matrix(), foot_arms(clip))
     toes = clip.root_pos[:, None] + arms
     ang_vel = rotation.apply(root_ang_vel)
     step = 1e-5  # s, for the toes' velocity within the body
-    moved = kinematics.foot_positions(clip.joint_pos + step * joint_vel)
+    moved = kinematics.foot_positions(clip.robot, clip.joint_pos + step * joint_vel)
     within = np.einsum("fij,flj->fli", rotation.as_matrix(), (moved - foot_arms(clip)) / step)
     toe_vel = root_vel[:, None] + np.cross(ang_vel[:, None], arms) + within
-    count = clip.num_frames
-    return np.concatenate(
-        [toes.reshape(count, 12), root_vel, ang_vel, joint_vel, toe_vel.reshape(count, 12)], axis=1
-    )
+    first, second, third = (_by_corner(clip, values) for values in (toes, joint_vel, toe_vel))
+    return [first, root_vel, ang_vel, second, third]
 
 
 def foot_arms(clip: Clip) -> np.ndarray:
     """Return the foot centres [F, 4, 3] m in the base frame."""
-    return kinematics.foot_positions(clip.joint_pos)
+    return kinematics.foot_positions(clip.robot, clip.joint_pos)
 
 
 def foot_paths(clip: Clip) -> np.ndarray:

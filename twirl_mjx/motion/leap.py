@@ -12,19 +12,19 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 
-import mujoco
 import numpy as np
 
 from twirl_mjx import files
 from twirl_mjx.assets import asset_path
 from twirl_mjx.motion.clip import Clip
-from twirl_mjx.motion.leap_config import LeapConfig
+from twirl_mjx.motion.leap_config import ROBOT, LeapConfig
 from twirl_mjx.motion.leap_plan import Layout, LeapMotion, make_layout
 from twirl_mjx.motion.leap_solver import solve_leap
 from twirl_mjx.motion.planar import planar_model
-from twirl_mjx.sim import a1
+from twirl_mjx.sim.mjcf import robot_model
+from twirl_mjx.sim.robot import Robot
 
-SHIPPED_PLAN = ("a1", "leap_plan.json")
+SHIPPED_PLAN = (ROBOT.name, "leap_plan.json")
 """Asset with the numbers of the shipped leap's plan, by name."""
 
 
@@ -33,6 +33,7 @@ def make_leap(
     progress: Callable[[str], None] | None = None,
     *,
     cold: bool = False,
+    robot: Robot = ROBOT,
 ) -> Clip:
     """Plan a leap and return it as a wrapping clip.
 
@@ -43,15 +44,22 @@ def make_leap(
         progress: Called with a line of text after every stage of the solver.
         cold: Start from a plain pronk instead of the shipped plan. Another number of run-up
             strides than the shipped plan's always starts cold.
+        robot: Who shall leap; only ``leap_config.ROBOT`` can.
 
     Returns:
         The clip, starting at take-off.
 
     Raises:
+        ValueError: another robot.
         RuntimeError: no motion with these properties was found; the message says what is missing.
     """
+    if robot is not ROBOT:
+        raise ValueError(
+            f"no leap can be planned for robot {robot.name!r}: the planner's start and bounds are"
+            f" those of {ROBOT.name!r} (nearest: a clip file of its own)"
+        )
     config = config or LeapConfig()
-    model = planar_model(mujoco.MjModel.from_xml_path(str(a1.xml_path())))
+    model = planar_model(robot_model(ROBOT))
     start = None if cold else shipped_plan(make_layout(config))
     motion, _ = solve_leap(config, model, progress, start)
     return motion_to_clip(motion, config.duration, "leap")

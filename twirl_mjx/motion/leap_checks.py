@@ -1,4 +1,4 @@
-"""Proof that a clip is a leap the A1 can do: kinematics, hurdle clearance, dynamics, motors.
+"""Proof that a clip is a leap its robot can do: kinematics, hurdle clearance, dynamics, motors.
 
 Torques come from inverse dynamics in C MuJoCo (``mj_inverse`` without contacts): the wrench that
 the trunk lacks is distributed over the standing feet by non-negative least squares on the edges of
@@ -18,8 +18,8 @@ from scipy import optimize
 from twirl_mjx.motion.clip import Clip, configurations, frame_velocities
 from twirl_mjx.motion.formats import foot_paths
 from twirl_mjx.motion.leap_solver import CONTROL_RATE
-from twirl_mjx.sim import a1
-from twirl_mjx.sim.actuation import BUTTER_A, BUTTER_B
+from twirl_mjx.sim.mjcf import robot_model
+from twirl_mjx.sim.robot import Robot
 
 BAND_LENGTH, BAND_HEIGHT = 0.2, 0.01
 """m, hurdle band (paper appendix)."""
@@ -84,7 +84,7 @@ class Dynamics:
 
 def standing_feet(clip: Clip) -> np.ndarray:
     """Return which feet stand in every frame, bool [F, 4]."""
-    return foot_paths(clip)[..., 2] - a1.FOOT_RADIUS < CONTACT_HEIGHT
+    return foot_paths(clip)[..., 2] - clip.robot.foot_radius < CONTACT_HEIGHT
 
 
 def longest_flight(clip: Clip) -> tuple[int, int]:
@@ -107,16 +107,15 @@ def inverse_dynamics(clip: Clip, friction: float = 0.6) -> Dynamics:
         clip: The motion; accelerations are central differences of its frames.
         friction: Friction coefficient of the pyramids the forces must lie in.
     """
-    model = mujoco.MjModel.from_xml_path(str(a1.xml_path()))
-    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
-    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_LIMIT
+    model, off = robot_model(clip.robot), mujoco.mjtDisableBit
+    model.opt.disableflags |= off.mjDSBL_CONTACT | off.mjDSBL_LIMIT
     data = mujoco.MjData(model)
     qvel = np.concatenate(frame_velocities(clip), axis=1)[:-1]
     qacc = _accelerations(clip, model)
     standing = standing_feet(clip)[:-1]
     # A central difference smears a force over the neighbouring frames.
     standing = standing | np.roll(standing, 1, axis=0) | np.roll(standing, -1, axis=0)
-    feet = [model.geom(name).id for name in a1.FOOT_GEOMS]
+    feet = [model.geom(name).id for name in clip.robot.feet]
     edges = np.array([[friction, 0, 1], [-friction, 0, 1], [0, friction, 1], [0, -friction, 1]])
     rows = []
     for frame in range(clip.num_frames - 1):
@@ -126,7 +125,7 @@ def inverse_dynamics(clip: Clip, friction: float = 0.6) -> Dynamics:
         mujoco.mj_subtreeVel(model, data)
         jacobians = np.zeros((4, 3, model.nv))
         for leg, geom in enumerate(feet):
-            point = data.geom_xpos[geom] - np.array([0.0, 0.0, a1.FOOT_RADIUS])
+            point = data.geom_xpos[geom] - np.array([0.0, 0.0, clip.robot.foot_radius])
             mujoco.mj_jac(model, data, jacobians[leg], None, point, int(model.geom_bodyid[geom]))
         legs = np.flatnonzero(standing[frame])
         force = np.zeros((4, 3))
@@ -171,12 +170,12 @@ def _distribute(wrench: np.ndarray, jacobians: np.ndarray, edges: np.ndarray) ->
     return share.reshape(-1, 4) @ edges
 
 
-def contact_ends(qpos: np.ndarray) -> np.ndarray:
-    """Return the ends of all contact shapes' axes [T, G, 2, 3] m at configurations [T, 19]."""
-    model = mujoco.MjModel.from_xml_path(str(a1.xml_path()))
+def contact_ends(robot: Robot, qpos: np.ndarray) -> np.ndarray:
+    """Return the ends of all contact shapes' axes [T, G, 2, 3] m at configurations [T, 7 + J]."""
+    model = robot_model(robot)
     data = mujoco.MjData(model)
-    bodies = [model.body(geom.mujoco_body).id for geom in a1.CONTACT_GEOMS]
-    local = np.array([geom.endpoints for geom in a1.CONTACT_GEOMS])
+    bodies = [model.body(robot.body_of(geom)).id for geom in robot.contact_geoms]
+    local = np.array([geom.endpoints for geom in robot.contact_geoms])
     ends = np.zeros((len(qpos), *local.shape))
     for row, values in enumerate(qpos):
         data.qpos[:] = values
@@ -193,10 +192,10 @@ def band_margins(clip: Clip, places: np.ndarray, step: float = 0.01) -> np.ndarr
     cycles. Negative: it touches; distances above ``MARGIN_CAP`` are not told apart.
     """
     times = np.arange(-clip.cycle_duration, 2 * clip.cycle_duration, step)
-    ends = contact_ends(configurations(clip, times))
+    ends = contact_ends(clip.robot, configurations(clip, times))
     share = np.linspace(0.0, 1.0, 15)[:, None]
     points = ends[..., None, 0, :] * (1 - share) + ends[..., None, 1, :] * share
-    radius = np.broadcast_to(a1.CONTACT_RADII[None, :, None], points.shape[:-1])
+    radius = np.broadcast_to(clip.robot.contact_radii[None, :, None], points.shape[:-1])
     low = points[..., 2] - radius < BAND_HEIGHT + MARGIN_CAP
     (x, _, z), radius = points[low].T, radius[low]
     margins = []
@@ -211,15 +210,15 @@ def band_margins(clip: Clip, places: np.ndarray, step: float = 0.01) -> np.ndarr
 def _kinematic_findings(clip: Clip) -> list[Finding]:
     """Return findings about speed, joints, feet and smoothness."""
     distance = float(clip.cycle_displacement[0])
-    box = np.stack([sign * a1.ACTION_HALF_RANGE for sign in (-1, 1)], axis=1)
-    low, high = (a1.DEFAULT_POSE[:, None] + box).T
-    low, high = np.maximum(low, a1.JOINT_LIMITS[:, 0]), np.minimum(high, a1.JOINT_LIMITS[:, 1])
+    robot = clip.robot
+    box = robot.default_pose[:, None] + np.outer(robot.action_half_range, [-1.0, 1.0])
+    low, high = np.clip(box.T, *robot.joint_limits.T)
     inside = float(np.minimum(clip.joint_pos - low, high - clip.joint_pos).min())
     feet, standing = foot_paths(clip), standing_feet(clip)
     both = standing[1:] & standing[:-1]
     moves = np.linalg.norm(np.diff(feet[..., :2], axis=0), axis=-1) * both
-    ends = contact_ends(clip.qpos)
-    lowest = float((ends[..., 2].min(axis=-1) - a1.CONTACT_RADII).min())
+    ends = contact_ends(clip.robot, clip.qpos)
+    lowest = float((ends[..., 2].min(axis=-1) - robot.contact_radii).min())
     seam = clip.qpos[-1] - clip.qpos[0]
     seam[:2] -= clip.cycle_displacement[:2]
     velocity = np.concatenate(frame_velocities(clip), axis=1)
@@ -268,50 +267,53 @@ def _flight_findings(clip: Clip, dynamics: Dynamics) -> list[Finding]:
     ]
 
 
+def ideal_targets(clip: Clip, dynamics: Dynamics) -> np.ndarray:
+    """Return the PD targets [F-1, J] in rad that make the motors give the clip's torques."""
+    rate = np.concatenate(frame_velocities(clip), axis=1)[:-1, 6:]
+    return clip.joint_pos[:-1] + (dynamics.torque + clip.robot.kd * rate) / clip.robot.kp
+
+
 def feed_forward(clip: Clip, dynamics: Dynamics) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the periodic 20 Hz actions whose filtered PD targets come closest to the ideal ones.
 
-    The ideal target ``q + (torque + kd dq) / kp`` makes a PD motor give exactly the torque of the
-    inverse dynamics. The cycle is taken as the nearest whole number K of control steps.
+    The cycle is taken as the nearest whole number K of control steps.
 
     Returns:
-        Actions [K, 12] in [-1, 1], the PD targets they give [K, 12] and the ideal targets, averaged
-        over the control steps [K, 12], both in rad.
+        Actions [K, J] in [-1, 1], the PD targets [K, J] in rad that they give, and the ideal ones
+        averaged over the control steps [K, J].
     """
-    rate = np.concatenate(frame_velocities(clip), axis=1)[:-1, 6:]
-    ideal = clip.joint_pos[:-1] + (dynamics.torque + a1.KD * rate) / a1.KP
+    robot = clip.robot
+    ideal = ideal_targets(clip, dynamics)
     steps, fine = max(round(clip.cycle_duration * CONTROL_RATE), 3), 20
     place = (np.arange(steps * fine) + 0.5) / (steps * fine) * len(ideal)
     grid = np.arange(len(ideal) + 1)
     closed = np.concatenate([ideal, ideal[:1]])
     wanted = np.stack([np.interp(place, grid, column) for column in closed.T], axis=1)
-    wanted = wanted.reshape(steps, fine, a1.NUM_JOINTS).mean(axis=1)
+    wanted = wanted.reshape(steps, fine, robot.num_joints).mean(axis=1)
     delay = np.roll(np.eye(steps), 1, axis=0)
     powers = np.stack([np.eye(steps), delay, delay @ delay])
-    lowpass = np.linalg.solve(
-        np.tensordot(BUTTER_A, powers, axes=1), np.tensordot(BUTTER_B, powers, axes=1)
-    )
-    actions = np.zeros((steps, a1.NUM_JOINTS))
-    for joint in range(a1.NUM_JOINTS):
-        scale = a1.ACTION_HALF_RANGE[joint]
+    b, a = robot.lowpass
+    lowpass = np.linalg.solve(np.tensordot(a, powers, axes=1), np.tensordot(b, powers, axes=1))
+    actions = np.zeros((steps, robot.num_joints))
+    for joint in range(robot.num_joints):
+        scale = robot.action_half_range[joint]
         system = np.vstack([scale * lowpass, 0.03 * np.eye(steps)])
-        goal = np.append(wanted[:, joint] - a1.DEFAULT_POSE[joint], np.zeros(steps))
+        goal = np.append(wanted[:, joint] - robot.default_pose[joint], np.zeros(steps))
         actions[:, joint] = optimize.lsq_linear(system, goal, bounds=(-1.0, 1.0)).x
-    given = a1.DEFAULT_POSE + a1.ACTION_HALF_RANGE * (lowpass @ actions)
-    given = np.clip(given, a1.JOINT_LIMITS[:, 0], a1.JOINT_LIMITS[:, 1])
+    given = robot.default_pose + robot.action_half_range * (lowpass @ actions)
+    given = np.clip(given, *robot.joint_limits.T)
     return actions, given, wanted
 
 
 def _motor_findings(clip: Clip, dynamics: Dynamics) -> list[Finding]:
     """Return findings about torques and about what the 20 Hz controller must be told."""
-    rate = np.concatenate(frame_velocities(clip), axis=1)[:-1, 6:]
-    target = clip.joint_pos[:-1] + (dynamics.torque + a1.KD * rate) / a1.KP
-    beyond = np.maximum(target - a1.JOINT_LIMITS[:, 1], a1.JOINT_LIMITS[:, 0] - target).max()
+    target, (low, high) = ideal_targets(clip, dynamics), clip.robot.joint_limits.T
+    beyond = np.maximum(target - high, low - target).max()
     _, given, wanted = feed_forward(clip, dynamics)
     missed = float(np.sqrt(((given - wanted) ** 2).mean(axis=0)).max())
-    inf = np.inf
+    inf, most = np.inf, float(clip.robot.torque_limit.min())
     return [
-        Finding("torque", float(np.abs(dynamics.torque).max()), 0.0, a1.TORQUE_LIMIT, "N m"),
+        Finding("torque", float(np.abs(dynamics.torque).max()), 0.0, most, "N m"),
         Finding("unexplained force", float(dynamics.unexplained_force.max()), 0.0, 6.0, "N"),
         Finding("unexplained moment", float(dynamics.unexplained_moment.max()), 0.0, 2.0, "N m"),
         Finding("PD target beyond the joint limits by", float(beyond), -inf, 0.1, "rad"),
@@ -344,5 +346,5 @@ def require_leap(clip: Clip) -> list[Finding]:
     findings = check_leap(clip)
     failed = [str(finding) for finding in findings if not finding.passed]
     if failed:
-        raise LeapError(f"{clip.name} is no leap the A1 can do:\n" + "\n".join(failed))
+        raise LeapError(f"{clip.name} is no leap its robot can do:\n" + "\n".join(failed))
     return findings

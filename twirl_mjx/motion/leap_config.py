@@ -4,6 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from twirl_mjx.sim.robots import A1
+
+ROBOT = A1
+"""The only robot the leap planner knows: its start, bounds and weights were tried for this one."""
+
 
 @dataclass(frozen=True)
 class LeapConfig:

@@ -17,9 +17,8 @@ from math import comb
 import numpy as np
 
 from twirl_mjx.motion import planar
-from twirl_mjx.motion.leap_config import LeapConfig
+from twirl_mjx.motion.leap_config import ROBOT, LeapConfig
 from twirl_mjx.motion.planar import GRAVITY, LinkStates, PlanarModel, Pose
-from twirl_mjx.sim import a1
 
 FORCE_NODES = 4
 """Inner control points of a ground force component (degree 5)."""
@@ -222,7 +221,7 @@ def feet_and_forces(
                 at[..., 0] -= cycle * config.cycle_length
                 feet[..., pair, :] = np.where(swinging[..., None], at, feet[..., pair, :])
                 standing = (clock >= begin - 1e-12) & (clock <= lift)
-                stand = np.stack([here - cycle * config.cycle_length, zero + a1.FOOT_RADIUS], -1)
+                stand = np.stack([here - cycle * config.cycle_length, zero + ROBOT.foot_radius], -1)
                 feet[..., pair, :] = np.where(standing[..., None], stand, feet[..., pair, :])
     return feet, force
 
@@ -232,8 +231,8 @@ def _swing_path(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the control points (x, z) [..., n+1] m of the swing that follows a stance."""
     forward = here + (there - here) * layout.get(params, f"swing_x_{name}")
-    lift = a1.FOOT_RADIUS + layout.get(params, f"swing_z_{name}")
-    ground = np.full_like(here, a1.FOOT_RADIUS)
+    lift = ROBOT.foot_radius + layout.get(params, f"swing_z_{name}")
+    ground = np.full_like(here, ROBOT.foot_radius)
     return (
         np.concatenate([here, here, forward, there, there], axis=-1),
         np.concatenate([ground, ground, lift, ground, ground], axis=-1),

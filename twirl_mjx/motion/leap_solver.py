@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import optimize
 
-from twirl_mjx.motion.leap_config import LeapConfig
+from twirl_mjx.motion.leap_config import ROBOT, LeapConfig
 from twirl_mjx.motion.leap_plan import (
     INERTIA,
     SLACK_NODES,
@@ -29,8 +29,6 @@ from twirl_mjx.motion.leap_plan import (
     plan_motion,
 )
 from twirl_mjx.motion.planar import GRAVITY, PlanarModel, joint_torques
-from twirl_mjx.sim import a1
-from twirl_mjx.sim.actuation import BUTTER_A, BUTTER_B
 
 CONTROL_RATE = 20.0
 """Hz, of the policy (paper, section "Actions")."""
@@ -104,7 +102,7 @@ def joint_motion(config: LeapConfig, model: PlanarModel, motion: LeapMotion) -> 
     angle = np.moveaxis(np.concatenate([pose.thigh, pose.calf], axis=-1), -1, -2)
     velocity, accel = periodic_derivatives(angle, dt)
     torque = np.moveaxis(np.concatenate(torques, axis=-1), -1, -2) + model.armature * accel
-    target = angle + (torque + a1.KD * velocity) / a1.KP
+    target = angle + (torque + ROBOT.kd[0] * velocity) / ROBOT.kp[0]
     return JointMotion(angle, velocity, accel, torque, target)
 
 
@@ -122,7 +120,8 @@ def filter_gains(count: int, duration: float) -> tuple[np.ndarray, np.ndarray]:
     """
     frequency = np.fft.rfftfreq(count, duration / count)
     delay = np.exp(-2j * np.pi * np.minimum(frequency / CONTROL_RATE, 0.5))
-    response = np.polyval(BUTTER_B[::-1], delay) / np.polyval(BUTTER_A[::-1], delay)
+    b, a = ROBOT.lowpass
+    response = np.polyval(b[::-1], delay) / np.polyval(a[::-1], delay)
     magnitude = np.abs(response) * np.sinc(frequency / CONTROL_RATE)
     magnitude[frequency > 0.45 * CONTROL_RATE] = 0.0
     inverse = magnitude / (magnitude**2 + 0.02**2)
@@ -167,13 +166,12 @@ def joint_residuals(
         x[..., :-1]
         for x in (joints.angle, joints.velocity, joints.accel, joints.torque, joints.target)
     )
-    box = [
-        _per_joint(*(a1.DEFAULT_POSE[1:3] + sign * a1.ACTION_HALF_RANGE[1:3])) for sign in (-1, 1)
-    ]
-    limits = a1.JOINT_LIMITS[1:3].T  # [low/high, thigh/calf]
+    pose, half_range = ROBOT.default_pose[1:3], ROBOT.action_half_range[1:3]
+    box = [_per_joint(*(pose + sign * half_range)) for sign in (-1, 1)]
+    limits = ROBOT.joint_limits[1:3].T  # [low/high, thigh/calf]
     low = np.maximum(box[0], _per_joint(*limits[0]))
     high = np.minimum(box[1], _per_joint(*limits[1]))
-    load = torque / a1.TORQUE_LIMIT
+    load = torque / ROBOT.torque_limit[0]
     spectrum = np.fft.rfft(target, axis=-1)
     unfiltered = np.fft.irfft(spectrum * gains[0], n=target.shape[-1], axis=-1)
     missed = target - np.fft.irfft(spectrum * gains[1], n=target.shape[-1], axis=-1)
@@ -193,7 +191,7 @@ def joint_residuals(
 def body_residuals(config: LeapConfig, mass: float, motion: LeapMotion) -> dict[str, np.ndarray]:
     """Return the residual blocks [..., *] about legs, feet, pitch and friction."""
     feet, knees = motion.feet[..., :-1, :, :], motion.states.knee[..., :-1, :, 1]
-    bottom = feet[..., 1] - a1.FOOT_RADIUS
+    bottom = feet[..., 1] - ROBOT.foot_radius
     weight = mass * GRAVITY
     # The middle of the leap is half-way between hind lift-off and hind landing.
     flight = 0.5 * config.flight_time * config.cycle_length / config.duration

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
-from twirl_mjx.sim import a1
+from twirl_mjx.motion.leap_config import ROBOT
 
 REACH = (0.1, 0.356)
 """m, leg lengths (hip to foot centre) the IK is clipped to, inside the calf's joint limits."""
@@ -86,15 +86,15 @@ def planar_model(model: mujoco.MjModel) -> PlanarModel:
         local = com - data.xpos[model.body(anchor).id][[0, 2]]
         return Link(float(masses.sum()), (local[0], local[1]), sum(about_y) + spread)
 
-    pairs = [[a1.LEGS[leg] for leg in legs] for legs in (a1.FRONT_LEGS, a1.HIND_LEGS)]
-    hips = [f"{leg}_hip" for leg in a1.LEGS]
+    pairs = [[ROBOT.legs[leg] for leg in legs] for legs in (ROBOT.front_legs, ROBOT.hind_legs)]
+    hips = [f"{leg}_hip" for leg in ROBOT.legs]
     thighs = [lump([f"{leg}_thigh" for leg in pair], f"{pair[0]}_thigh") for pair in pairs]
     calves = [lump([f"{leg}_calf" for leg in pair], f"{pair[0]}_calf") for pair in pairs]
     return PlanarModel(
-        trunk=lump([a1.TRUNK_BODY, *hips], a1.TRUNK_BODY),
+        trunk=lump([ROBOT.trunk, *hips], ROBOT.trunk),
         thighs=(thighs[0], thighs[1]),
         calves=(calves[0], calves[1]),
-        armature=a1.JOINT_ARMATURE,
+        armature=float(ROBOT.armature[0]),
     )
 
 
@@ -112,7 +112,7 @@ def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 def hip_positions(root: np.ndarray, pitch: np.ndarray) -> np.ndarray:
     """Return the leg-plane hip joints [..., 2 pairs, 2] of a trunk pose [..., 2], [...]."""
-    half = a1.HIP_OFFSETS[0, 0]
+    half = ROBOT.hip_offsets[0, 0]
     forward = np.stack([np.cos(pitch), -np.sin(pitch)], axis=-1) * half
     return np.stack([root + forward, root - forward], axis=-2)
 
@@ -132,7 +132,7 @@ def leg_ik(
     """
     leg = feet - hip_positions(root, pitch)
     length = np.linalg.norm(leg, axis=-1)
-    half_knee = np.arccos(np.clip(length, *REACH) / (2.0 * a1.THIGH_LENGTH))
+    half_knee = np.arccos(np.clip(length, *REACH) / (2.0 * ROBOT.thigh_length))
     direction = np.arctan2(-leg[..., 0], -leg[..., 1]) - pitch[..., None]
     direction = (direction + np.pi) % (2 * np.pi) - np.pi
     return direction + half_knee, -2.0 * half_knee, length
@@ -157,7 +157,7 @@ def link_states(model: PlanarModel, pose: Pose) -> LinkStates:
     hip = hip_positions(pose.root, pose.pitch)
     thigh_angle = pose.pitch[..., None] + pose.thigh
     calf_angle = thigh_angle + pose.calf
-    knee = hip + turn(thigh_angle, np.array([0.0, -a1.THIGH_LENGTH]))
+    knee = hip + turn(thigh_angle, np.array([0.0, -ROBOT.thigh_length]))
     thigh_com = hip + turn(thigh_angle, np.array([link.com for link in model.thighs]))
     calf_com = knee + turn(calf_angle, np.array([link.com for link in model.calves]))
     trunk_com = pose.root + turn(pose.pitch, np.array(model.trunk.com))

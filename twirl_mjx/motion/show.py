@@ -15,7 +15,6 @@ import numpy as np
 from twirl_mjx import files
 from twirl_mjx.motion.clip import Clip, headings
 from twirl_mjx.motion.formats import foot_paths
-from twirl_mjx.sim import a1
 
 FOOT_COLORS = ("#D55E00", "#E69F00", "#0072B2", "#56B4E9")
 """FR FL RR RL: warm colours in front, cold ones behind (Okabe and Ito's palette)."""
@@ -46,7 +45,9 @@ def show(clip: Clip, path: str | Path) -> None:
         path: Image file to write; the ending decides the format.
     """
     times = np.arange(clip.num_frames) * clip.frame_duration
-    lowest = foot_paths(clip)[..., 2] - a1.FOOT_RADIUS
+    corners = list(clip.robot.corners)
+    names = [clip.robot.legs[leg] for leg in corners]
+    lowest = foot_paths(clip)[:, corners, 2] - clip.robot.foot_radius
     figure = matplotlib.figure.Figure(figsize=(7.0, 6.2), layout="constrained")
     height, pitch, feet, phases = figure.subplots(
         4, 1, sharex=True, gridspec_kw={"height_ratios": [2, 1.4, 2, 1.2]}
@@ -56,7 +57,7 @@ def show(clip: Clip, path: str | Path) -> None:
     pitch.plot(times, pitch_angles(clip), color="black")
     pitch.axhline(0.0, color="0.8", lw=0.8, zorder=0)
     pitch.set_ylabel("nose-up pitch (deg)")
-    for leg, (name, color) in enumerate(zip(a1.LEGS, FOOT_COLORS, strict=True)):
+    for leg, (name, color) in enumerate(zip(names, FOOT_COLORS, strict=True)):
         # Right legs are dashed and on top: in a bound they hide the left ones.
         style = {"ls": "-", "zorder": 2} if leg % 2 else {"ls": (0, (4, 4)), "zorder": 3}
         feet.plot(times, lowest[:, leg], color=color, label=name, **style)
@@ -79,7 +80,7 @@ def show(clip: Clip, path: str | Path) -> None:
             zorder=-1,
         )
         axes.spines[["top", "right"]].set_visible(False)
-    phases.set_yticks(range(4), a1.LEGS[::-1])
+    phases.set_yticks(range(len(names)), names[::-1])
     phases.set_ylabel("contact")
     phases.set_xlabel("time (s), all feet airborne where shaded")
     distance = float(np.linalg.norm(clip.cycle_displacement[:2]))
@@ -105,13 +106,17 @@ def compare(clips: Sequence[Clip], path: str | Path, source: str = "") -> None:
     for index, clip in enumerate(clips):
         root, feet = forward_paths(clip)
         times = np.arange(clip.num_frames) * clip.frame_duration
-        lowest = feet[..., 2] - a1.FOOT_RADIUS
+        lowest = feet[..., 2] - clip.robot.foot_radius
         apex = np.argmax(lowest.min(axis=1))  # line the leaps up where they clear the most
         style = {"color": colors[index % len(colors)], "lw": 1.8 if index == 0 else 1.1}
         axes[0].plot(root[:, 0] - root[apex, 0], root[:, 2], label=clip.name, **style)
         axes[1].plot(times - times[apex], pitch_angles(clip), **style)
-        axes[2].plot(times - times[apex], lowest[:, :2].min(axis=1), **style)
-        axes[3].plot(times - times[apex], lowest[:, 2:].min(axis=1), **style)
+        axes[2].plot(
+            times - times[apex], lowest[:, list(clip.robot.front_legs)].min(axis=1), **style
+        )
+        axes[3].plot(
+            times - times[apex], lowest[:, list(clip.robot.hind_legs)].min(axis=1), **style
+        )
     axes[0].set_xlabel("distance from the top of the leap (m)")
     axes[0].set_ylabel("root height (m)")
     axes[0].legend(frameon=False, fontsize=8, loc="upper right")

@@ -14,13 +14,14 @@ from scipy import signal
 
 from twirl_mjx.motion.clip import Clip, frame_velocities
 from twirl_mjx.motion.leap_checks import CONTROL_RATE, feed_forward, inverse_dynamics
-from twirl_mjx.sim import a1
-from twirl_mjx.sim.actuation import BUTTER_A, BUTTER_B
+from twirl_mjx.sim.mjcf import robot_spec
+from twirl_mjx.sim.robot import CALF, FOOT, Robot
 
 
-def robot_on_floor() -> mujoco.MjModel:
+def robot_on_floor(robot: Robot) -> mujoco.MjModel:
     """Return the robot on a plane with friction 1, stepped at 5 ms."""
-    spec = mujoco.MjSpec.from_file(str(a1.xml_path()))
+    spec = robot_spec(robot, (FOOT, CALF))
+    spec.option.timestep = 0.005
     spec.worldbody.add_geom(
         name="floor",
         type=mujoco.mjtGeom.mjGEOM_PLANE,
@@ -34,7 +35,7 @@ def robot_on_floor() -> mujoco.MjModel:
 
 
 def clip_state(clip: Clip, time: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return qpos [19] and qvel [18] at the frame nearest to ``time`` s of a wrapping clip."""
+    """Return qpos and qvel at the frame nearest to ``time`` s of a wrapping clip."""
     frame = round(time / clip.frame_duration)
     cycle, frame = divmod(frame, clip.num_frames - 1)
     qpos = clip.qpos[frame].copy()
@@ -51,21 +52,21 @@ def open_loop(clip: Clip, start: float, duration: float) -> tuple[np.ndarray, np
         duration: s.
 
     Returns:
-        Simulated and reference configurations at the ends of the control steps, [K, 19] each.
+        Simulated and reference configurations at the ends of the control steps, [K, 7 + J] each.
     """
     actions, _, _ = feed_forward(clip, inverse_dynamics(clip))
-    cycle, targets = len(actions), a1.DEFAULT_POSE + actions * a1.ACTION_HALF_RANGE
+    robot = clip.robot
+    cycle, targets = len(actions), robot.default_pose + actions * robot.action_half_range
     repeated = np.tile(targets, (8, 1))
-    settled = np.asarray(signal.lfilter(BUTTER_B, BUTTER_A, repeated, axis=0))[-cycle:]
-    model = robot_on_floor()
+    settled = np.asarray(signal.lfilter(*robot.lowpass, repeated, axis=0))[-cycle:]
+    model = robot_on_floor(robot)
     data = mujoco.MjData(model)
     first = round(start * CONTROL_RATE)
     step = clip.cycle_duration / cycle
     data.qpos[:], data.qvel[:] = clip_state(clip, first * step)
     simulated, reference = [], []
     for now in range(first, first + round(duration * CONTROL_RATE)):
-        limits = a1.JOINT_LIMITS
-        data.ctrl[:] = np.clip(settled[now % cycle], limits[:, 0], limits[:, 1])
+        data.ctrl[:] = np.clip(settled[now % cycle], *robot.joint_limits.T)
         mujoco.mj_step(model, data, nstep=round(step / model.opt.timestep))
         simulated.append(data.qpos.copy())
         reference.append(clip_state(clip, (now + 1) * step)[0])

@@ -31,7 +31,7 @@ class ClipPolicy:
     def __init__(self, clip: Clip) -> None:
         """Solve for the actions of one cycle."""
         self.actions = feed_forward(clip, inverse_dynamics(clip))[0].astype(np.float32)
-        """[K, 12] in [-1, 1]."""
+        """[K, A] in [-1, 1]."""
         self._step = clip.cycle_duration / len(self.actions)
         self._standing = round(standing_time(clip) / self._step)
         times = jnp.arange(len(self.actions), dtype=jnp.float32) * self._step
@@ -48,7 +48,7 @@ class ClipPolicy:
         return jnp.where(still, self._standing, jnp.argmin(error)).astype(jnp.int32)
 
     def act(self, memory: jax.Array, state: Any, key: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Return actions [N, 12] and the advanced clocks [N]."""
+        """Return actions [N, A] and the advanced clocks [N]."""
         del key
         clock = jnp.where(state.world.episode_step == 0, self.init(state), memory)
         return jnp.asarray(self.actions)[clock % len(self.actions)], clock + 1

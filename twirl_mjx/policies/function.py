@@ -10,9 +10,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from twirl_mjx.sim.robot import LEG_SIZE, NUM_LEGS
 from twirl_mjx.types import Policy
 
-ACTION_SIZE = 12
+ACTION_SIZE = NUM_LEGS * LEG_SIZE
+"""A of every robot of the family."""
 
 
 def default_observe(state: Any) -> jax.Array:

@@ -19,6 +19,7 @@ from twirl_mjx.policies.function import from_policy
 from twirl_mjx.policies.learned import NumpyPolicy, PolicyFileError, PolicyHeader, load_policy
 from twirl_mjx.policies.onnx_file import OnnxPolicy
 from twirl_mjx.policies.source import ActOnObs, ObservingSource, OwnTaskSource, actor_act
+from twirl_mjx.sim.robots import ROBOTS
 from twirl_mjx.tasks.imitate import ImitateOptions, load_clip
 from twirl_mjx.tasks.observations import layout_size
 from twirl_mjx.tasks.registry import TASKS
@@ -153,8 +154,10 @@ def _act_of(loaded: NumpyPolicy | OnnxPolicy, noise: bool) -> ActOnObs:
 
 def _scripted(name: str, config: WorldConfig) -> Source:
     if name != "clip":
-        return Source(scripted.get_scripted(name), f"scripted {name}", name)
-    clip = load_clip(clip_name(config))
+        return Source(
+            scripted.get_scripted(name, ROBOTS.get(config.robot)), f"scripted {name}", name
+        )
+    clip = load_clip(clip_name(config), ROBOTS.get(config.robot))
     content = hashlib.sha256(clip.qpos.tobytes()).hexdigest()[:12]
     return Source(ClipPolicy(clip), f"scripted {name}", f"clip {content}")
 

@@ -1,7 +1,7 @@
 """Source policies nobody trained: open-loop gaits with a phase clock, stillness and noise.
 
 A gait is a table of one period. Foot paths (a half-ellipse swing, a flat stance) become joint
-angles by closed-form leg kinematics, and the joint angles become actions by inverting the 4 Hz
+angles by closed-form leg kinematics, and the joint angles become actions by inverting the
 command filter harmonic by harmonic: a periodic signal keeps its frequencies, so what comes out
 of the filter is the wanted joint path itself, without lag.
 """
@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -17,17 +18,24 @@ import jax.numpy as jnp
 import numpy as np
 
 from twirl_mjx.checks import check_choice
-from twirl_mjx.sim import a1, kinematics
-from twirl_mjx.sim.actuation import BUTTER_A, BUTTER_B
+from twirl_mjx.sim import kinematics
+from twirl_mjx.sim.robot import NUM_LEGS, Robot
+from twirl_mjx.sim.robots import A1
 from twirl_mjx.types import SourcePolicy
+
+LEG_LENGTH = 0.4
+"""m, thigh and calf of the robot whose gaits are written here; others take longer steps."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Gait:
-    """A periodic gait; legs in the order FR FL RR RL, hips in the order front, hind."""
+    """A periodic gait; legs in the order FR FL RR RL, hips in the order front, hind.
+
+    Lengths are those of a robot with legs of ``LEG_LENGTH``.
+    """
 
     period_steps: int
-    """Control steps (50 ms) of one period."""
+    """Control steps of one period."""
     offsets: tuple[float, float, float, float]
     """Phase offset of each leg in periods; a leg touches down when its phase passes 0."""
     duty: float
@@ -95,15 +103,16 @@ def foot_path(gait: Gait, phase: np.ndarray, hind: int) -> tuple[np.ndarray, np.
     return x, height - gait.depth[hind]
 
 
-def unfilter(targets: np.ndarray) -> np.ndarray:
-    """Return the periodic command whose filtered form is ``targets`` [P, J].
+def unfilter(robot: Robot, targets: np.ndarray) -> np.ndarray:
+    """Return the periodic command whose filtered form is ``targets`` [P, K].
 
     Harmonics that the filter passes at less than a quarter are left out: they would ask for
     commands of several times the motion.
     """
     period = len(targets)
     z = np.exp(-2j * np.pi * np.arange(period // 2 + 1) / period)
-    gain = np.polyval(BUTTER_B[::-1], z) / np.polyval(BUTTER_A[::-1], z)
+    b, a = robot.lowpass
+    gain = np.polyval(b[::-1], z) / np.polyval(a[::-1], z)
     keep = np.abs(gain) >= 0.25
     spectrum = np.fft.rfft(targets, axis=0)
     command = np.where(keep[:, None], spectrum / np.where(keep, gain, 1.0)[:, None], 0.0)
@@ -111,19 +120,21 @@ def unfilter(targets: np.ndarray) -> np.ndarray:
 
 
 @functools.cache
-def action_table(gait: Gait) -> np.ndarray:
-    """Return one period of actions [P, 12] float32 in [-1, 1].
+def action_table(gait: Gait, robot: Robot = A1) -> np.ndarray:
+    """Return one period of actions [P, A] float32 in [-1, 1].
 
     Raises:
         ValueError: a foot out of reach, or a joint path outside the action box.
     """
-    feet = np.zeros((gait.period_steps, 4, 3))
-    feet[:, :, 1] = a1.SIDE_SIGNS * a1.THIGH_OFFSET
-    for leg, offset in enumerate(gait.offsets):
+    feet = np.zeros((gait.period_steps, NUM_LEGS, 3))
+    feet[:, :, 1] = robot.side_signs * robot.thigh_offset
+    size = (robot.thigh_length + robot.calf_length) / LEG_LENGTH
+    for leg, offset in zip(robot.corners, gait.offsets, strict=True):
         phase = (np.arange(gait.period_steps) / gait.period_steps + offset) % 1.0
-        feet[:, leg, 0], feet[:, leg, 2] = foot_path(gait, phase, leg // 2)
-    joints = kinematics.leg_inverse(feet + a1.HIP_OFFSETS)
-    action = (unfilter(joints) - a1.DEFAULT_POSE) / a1.ACTION_HALF_RANGE
+        x, z = foot_path(gait, phase, int(leg in robot.hind_legs))
+        feet[:, leg, 0], feet[:, leg, 2] = size * x, size * z
+    joints = kinematics.leg_inverse(robot, feet + robot.hip_offsets)
+    action = (unfilter(robot, joints) - robot.default_pose) / robot.action_half_range
     worst = np.abs(action).max()
     if worst > 1.0:
         raise ValueError(
@@ -138,16 +149,18 @@ class GaitPolicy:
 
     gait: Gait
     """The gait."""
+    robot: Robot = A1
+    """Whose legs play it."""
 
     def init(self, state: Any) -> jax.Array:
         """Return stopped clocks [N]."""
         return jnp.zeros(state.world.episode_step.shape, jnp.int32)
 
     def act(self, memory: jax.Array, state: Any, key: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Return actions [N, 12] and the advanced clocks [N]."""
+        """Return actions [N, A] and the advanced clocks [N]."""
         del key
         clock = jnp.where(state.world.episode_step == 0, 0, memory)
-        table = jnp.asarray(action_table(self.gait))
+        table = jnp.asarray(action_table(self.gait, self.robot))
         fade = jnp.minimum(clock.astype(jnp.float32) / max(self.gait.ramp_steps, 1), 1.0)
         return table[clock % self.gait.period_steps] * fade[..., None], clock + 1
 
@@ -161,10 +174,9 @@ class ZeroPolicy:
         del state
 
     def act(self, memory: None, state: Any, key: jax.Array) -> tuple[jax.Array, None]:
-        """Return zero actions [N, 12]."""
+        """Return zero actions [N, A]."""
         del key
-        worlds = state.world.episode_step.shape
-        return jnp.zeros((*worlds, a1.NUM_JOINTS), jnp.float32), memory
+        return jnp.zeros(state.world.action.shape, jnp.float32), memory
 
 
 @dataclasses.dataclass(frozen=True)
@@ -176,16 +188,16 @@ class RandomPolicy:
         del state
 
     def act(self, memory: None, state: Any, key: jax.Array) -> tuple[jax.Array, None]:
-        """Return random actions [N, 12]."""
-        shape = (*state.world.episode_step.shape, a1.NUM_JOINTS)
-        return jax.random.uniform(key, shape, jnp.float32, -1.0, 1.0), memory
+        """Return random actions [N, A]."""
+        return jax.random.uniform(key, state.world.action.shape, jnp.float32, -1.0, 1.0), memory
 
 
 class ClockedGait:
     """A gait as a deployable policy: numpy only, and one clock that ``reset`` stops."""
 
-    def __init__(self, gait: Gait) -> None:
+    def __init__(self, gait: Gait, robot: Robot = A1) -> None:
         self.gait = gait
+        self.robot = robot
         self.clock = 0
 
     def reset(self) -> None:
@@ -193,27 +205,28 @@ class ClockedGait:
         self.clock = 0
 
     def act(self, obs: np.ndarray) -> np.ndarray:
-        """Return the next action [..., 12]; of ``obs`` [..., O] only the shape is used."""
+        """Return the next action [..., A]; of ``obs`` [..., O] only the shape is used."""
         fade = min(self.clock / max(self.gait.ramp_steps, 1), 1.0)
-        action = action_table(self.gait)[self.clock % self.gait.period_steps] * np.float32(fade)
+        table = action_table(self.gait, self.robot)
+        action = table[self.clock % self.gait.period_steps] * np.float32(fade)
         self.clock += 1
-        return np.broadcast_to(action, (*np.shape(obs)[:-1], a1.NUM_JOINTS)).copy()
+        return np.broadcast_to(action, (*np.shape(obs)[:-1], len(action))).copy()
 
 
-SCRIPTED: dict[str, SourcePolicy] = {
-    "trot": GaitPolicy(TROT),
-    "bound": GaitPolicy(BOUND),
-    "zero": ZeroPolicy(),
-    "random": RandomPolicy(),
+SCRIPTED: dict[str, Callable[[Robot], SourcePolicy]] = {
+    "trot": functools.partial(GaitPolicy, TROT),
+    "bound": functools.partial(GaitPolicy, BOUND),
+    "zero": lambda robot: ZeroPolicy(),
+    "random": lambda robot: RandomPolicy(),
 }
-"""Scripted source policies by name."""
+"""Scripted source policies of a robot, by name."""
 
 
-def get_scripted(name: str) -> SourcePolicy:
-    """Return a scripted source policy.
+def get_scripted(name: str, robot: Robot = A1) -> SourcePolicy:
+    """Return a scripted source policy of a robot.
 
     Raises:
         ValueError: unknown name; the message gives the closest one.
     """
     check_choice("scripted policy", name, tuple(SCRIPTED))
-    return SCRIPTED[name]
+    return SCRIPTED[name](robot)

@@ -13,7 +13,7 @@ from twirl_mjx.tasks.observations import Observer
 from twirl_mjx.types import Learner
 
 ActOnObs = Callable[[jax.Array, jax.Array], jax.Array]
-"""(observations [N, O], key) -> actions [N, 12]; traceable by jax."""
+"""(observations [N, O], key) -> actions [N, A]; traceable by jax."""
 
 
 class ObservedMemory(flax.struct.PyTreeNode):

@@ -1,6 +1,6 @@
 """From a policy's action to joint torques: scaling, low-pass filter, motor model.
 
-Paper, section "Actions": an action in [-1, 1]^12 is an offset around the default
+Paper, section "Actions": an action in [-1, 1]^J is an offset around the default
 pose, low-pass filtered as an absolute joint target, clipped to the joint limits and tracked by a
 PD controller inside the physics engine.
 """
@@ -12,13 +12,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from twirl_mjx.sim import a1
 from twirl_mjx.sim.dynamics import Dynamics, Place
-
-BUTTER_B = (0.20657208, 0.41314417, 0.20657208)
-"""Numerator of ``scipy.signal.butter(2, 0.4)``: 2nd order, 4 Hz cut-off at fs = 20 Hz."""
-BUTTER_A = (1.0, -0.36952738, 0.19581571)
-"""Denominator of the same filter."""
+from twirl_mjx.sim.robot import LEG_SIZE, NUM_LEGS, Robot
 
 AMBIENT_TEMPERATURE = 25.0
 """deg C, motor temperature without load."""
@@ -38,33 +33,33 @@ class FilterState(flax.struct.PyTreeNode):
     """Memory of the Butterworth filter of one world, joint targets in rad."""
 
     inputs: jax.Array
-    """[2, 12] the last two inputs, newest first."""
+    """[2, J] the last two inputs, newest first."""
     outputs: jax.Array
-    """[2, 12] the last two outputs, newest first, before the joint-limit clip."""
+    """[2, J] the last two outputs, newest first, before the joint-limit clip."""
 
 
 class MotorState(flax.struct.PyTreeNode):
-    """Condition of the 12 motors of one world (order FR FL RR RL x hip thigh calf)."""
+    """Condition of the J motors of one world, in the order of the robot's joints."""
 
     strength: jax.Array
-    """[12] scale of gains and torque limit, constant within an episode."""
+    """[J] scale of gains and torque limit, constant within an episode."""
     temperature: jax.Array
-    """[12] deg C."""
+    """[J] deg C."""
 
 
 class MotorCommand(flax.struct.PyTreeNode):
     """What the physics engine is given for one control step of one world."""
 
     target: jax.Array
-    """[12] rad, PD set-point."""
+    """[J] rad, PD set-point."""
     kp: jax.Array
-    """[12] N m / rad."""
+    """[J] N m / rad."""
     kd: jax.Array
-    """[12] N m s / rad."""
+    """[J] N m s / rad."""
     torque_limit: jax.Array
-    """[12] N m."""
+    """[J] N m."""
     late_targets: jax.Array | None = None
-    """[S, 12] rad, PD set-point in every physics substep where targets come late."""
+    """[S, J] rad, PD set-point in every physics substep where targets come late."""
 
 
 MOTOR_PLACES: dict[str, tuple[Place, ...]] = {
@@ -85,62 +80,59 @@ MOTOR_PLACES: dict[str, tuple[Place, ...]] = {
 
 
 def filter_init(joint_pos: jax.Array) -> FilterState:
-    """Start the filter at rest at ``joint_pos`` [12] rad."""
+    """Start the filter at rest at ``joint_pos`` [J] rad."""
     both = jnp.stack([joint_pos, joint_pos])
     return FilterState(inputs=both, outputs=both)
 
 
-def action_to_target(action: jax.Array) -> jax.Array:
-    """Scale an action [..., 12] in [-1, 1] to an absolute joint target in rad, unfiltered."""
-    return jnp.asarray(a1.DEFAULT_POSE, action.dtype) + action * jnp.asarray(
-        a1.ACTION_HALF_RANGE, action.dtype
-    )
+def action_to_target(robot: Robot, action: jax.Array) -> jax.Array:
+    """Scale an action [..., J] in [-1, 1] to an absolute joint target in rad, unfiltered."""
+    half_range = jnp.asarray(robot.action_half_range, action.dtype)
+    return jnp.asarray(robot.default_pose, action.dtype) + action * half_range
 
 
-def filter_step(state: FilterState, target: jax.Array) -> tuple[jax.Array, FilterState]:
+def filter_step(
+    robot: Robot, state: FilterState, target: jax.Array
+) -> tuple[jax.Array, FilterState]:
     """Advance the low-pass filter by one control step.
 
     Args:
+        robot: Whose filter and limits.
         state: Filter memory.
-        target: [12] rad, unfiltered joint target.
+        target: [J] rad, unfiltered joint target.
 
     Returns:
-        The filtered target [12] rad clipped to the joint limits, and the new memory.
+        The filtered target [J] rad clipped to the joint limits, and the new memory.
     """
     x, y = state.inputs, state.outputs
-    filtered = (
-        BUTTER_B[0] * target
-        + BUTTER_B[1] * x[0]
-        + BUTTER_B[2] * x[1]
-        - BUTTER_A[1] * y[0]
-        - BUTTER_A[2] * y[1]
-    )
-    limits = jnp.asarray(a1.JOINT_LIMITS, target.dtype)
+    b, a = robot.lowpass
+    filtered = b[0] * target + b[1] * x[0] + b[2] * x[1] - a[1] * y[0] - a[2] * y[1]
+    limits = jnp.asarray(robot.joint_limits, target.dtype)
     new_state = FilterState(inputs=jnp.stack([target, x[0]]), outputs=jnp.stack([filtered, y[0]]))
     return jnp.clip(filtered, limits[:, 0], limits[:, 1]), new_state
 
 
-def whole_motors() -> MotorState:
+def whole_motors(robot: Robot) -> MotorState:
     """Return motors of full strength without load."""
     return MotorState(
-        strength=jnp.ones(a1.NUM_JOINTS),
-        temperature=jnp.full(a1.NUM_JOINTS, AMBIENT_TEMPERATURE),
+        strength=jnp.ones(robot.num_joints),
+        temperature=jnp.full(robot.num_joints, AMBIENT_TEMPERATURE),
     )
 
 
 def motor_init(key: jax.Array, dynamics: Dynamics) -> MotorState:
     """Draw the motors' condition for one episode.
 
-    leg = U{FR, FL, RR, RL}; strength[leg] = U(leg_strength_min, 1), others 1;
+    leg = U{0, 1, 2, 3}; strength[leg] = U(leg_strength_min, 1), others 1;
     temperature = U(25, 60) deg C per motor where motors heat, else 25.
     """
     leg_key, strength_key, heat_key = jax.random.split(key, 3)
-    leg = jax.random.randint(leg_key, (), 0, 4)
+    leg = jax.random.randint(leg_key, (), 0, NUM_LEGS)
     low = dynamics.leg_strength_min
     strength = low + (1.0 - low) * jax.random.uniform(strength_key)
-    weak = jnp.repeat(jnp.arange(4) == leg, 3)
+    weak = jnp.repeat(jnp.arange(NUM_LEGS) == leg, LEG_SIZE)
     spread = MAX_START_TEMPERATURE - AMBIENT_TEMPERATURE
-    warm = jax.random.uniform(heat_key, (12,)) * spread * (dynamics.heat_rate > 0.0)
+    warm = jax.random.uniform(heat_key, weak.shape) * spread * (dynamics.heat_rate > 0.0)
     return MotorState(
         strength=jnp.where(weak, strength, 1.0), temperature=AMBIENT_TEMPERATURE + warm
     )
@@ -152,19 +144,21 @@ def derating(temperature: jax.Array) -> jax.Array:
     return 1.0 - (1.0 - DERATED_FRACTION) * jnp.clip(excess, 0.0, 1.0)
 
 
-def motor_command(motors: MotorState, target: jax.Array, dynamics: Dynamics) -> MotorCommand:
-    """Return gains and torque limits for one control step towards ``target`` [12] rad."""
+def motor_command(
+    robot: Robot, motors: MotorState, target: jax.Array, dynamics: Dynamics
+) -> MotorCommand:
+    """Return gains and torque limits for one control step towards ``target`` [J] rad."""
 
-    def scaled(value: float, name: str) -> jax.Array:
+    def scaled(value: np.ndarray, name: str) -> jax.Array:
         scale = getattr(dynamics, name)
-        whole = value * motors.strength
+        whole = jnp.asarray(value, jnp.float32) * motors.strength
         return whole if scale is None else whole * scale
 
     return MotorCommand(
         target=target,
-        kp=scaled(a1.KP, "kp_scale"),
-        kd=scaled(a1.KD, "kd_scale"),
-        torque_limit=scaled(a1.TORQUE_LIMIT, "motor_strength") * derating(motors.temperature),
+        kp=scaled(robot.kp, "kp_scale"),
+        kd=scaled(robot.kd, "kd_scale"),
+        torque_limit=scaled(robot.torque_limit, "motor_strength") * derating(motors.temperature),
     )
 
 
@@ -187,9 +181,9 @@ def delay(
 
 
 def pd_torque(command: MotorCommand, joint_pos: jax.Array, joint_vel: jax.Array) -> jax.Array:
-    """Return the torques [..., 12] in N m the engine applies at the given joint state [..., 12].
+    """Return the torques [..., J] in N m the engine applies at the given joint state [..., J].
 
-    Of a command with late targets, the joint states are those of its substeps [S, 12].
+    Of a command with late targets, the joint states are those of its substeps [S, J].
     """
     target = command.target if command.late_targets is None else command.late_targets
     raw = command.kp * (target - joint_pos) - command.kd * joint_vel
@@ -205,7 +199,7 @@ def motor_heat(motors: MotorState, dynamics: Dynamics, torque: jax.Array, dt: fl
     Args:
         motors: Present condition.
         dynamics: Scalars of one world.
-        torque: [S, 12] N m at every physics substep.
+        torque: [S, J] N m at every physics substep.
         dt: s, control step.
     """
     gain = dynamics.heat_rate * jnp.mean(torque**2, axis=0)

@@ -177,8 +177,8 @@ def copy_model(scene: Scene) -> mujoco.MjModel:
 
 def world_model(scene: Scene, dynamics: Dynamics) -> mujoco.MjModel:
     """Return a copy of the scene's model with one world's parameters (scalars), motors whole."""
-    whole = actuation.whole_motors()
-    command = actuation.motor_command(whole, jnp.zeros_like(whole.strength), dynamics)
+    whole = actuation.whole_motors(scene.robot)
+    command = actuation.motor_command(scene.robot, whole, jnp.zeros_like(whole.strength), dynamics)
     model = copy_model(scene)
     values = jax.device_get(model_values(scene, command, dynamics))
     write_physics(scene, model, {k: np.asarray(v, np.float64)[()] for k, v in values.items()})

@@ -12,7 +12,6 @@ import math
 import mujoco
 import numpy as np
 
-from twirl_mjx.sim import a1
 from twirl_mjx.sim.dynamics import (
     LEAVES,
     NOMINAL_VALUES,
@@ -22,6 +21,7 @@ from twirl_mjx.sim.dynamics import (
     get_shift,
     leaf_value,
 )
+from twirl_mjx.sim.robot import Robot
 
 LOW, HIGH = np.array([0.36, 0.27, 0.20]), np.array([0.97, 0.91, 0.76])
 """Colours of the lowest and the highest point of the heightfield."""
@@ -96,24 +96,27 @@ def _add_relief(spec: mujoco.MjSpec, bumps: np.ndarray) -> None:
     material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "ground"
 
 
-def paint(model: mujoco.MjModel, dynamics: Dynamics, leg_strength: np.ndarray) -> None:
+def paint(
+    model: mujoco.MjModel, robot: Robot, dynamics: Dynamics, leg_strength: np.ndarray
+) -> None:
     """Colour a model by the condition of its world.
 
     Args:
         model: Changed in place.
+        robot: The robot in it.
         dynamics: Scalars. Ice and Mars are fully there at the shift's own value.
-        leg_strength: [4] in [0, 1], order FR FL RR RL; a whole leg keeps its colours.
+        leg_strength: [4] in [0, 1], order ``robot.legs``; a whole leg keeps its colours.
     """
     ice, mars = (_progress(dynamics, name, leaf) for name, leaf in PAINTED)
     ground = model.mat("ground").id
     model.mat_rgba[ground, :3] *= 1.0 + ice * (ICE - 1.0) + mars * (MARS - 1.0)
     model.mat_specular[ground] += 0.5 * ice
     model.mat_shininess[ground] += 0.5 * ice
-    for leg, strength in zip(a1.LEGS, leg_strength, strict=True):
+    for links, strength in zip(robot.links, leg_strength, strict=True):
         if strength >= 1.0:
             continue
-        for part in ("hip", "thigh", "calf"):
-            body = model.body(f"{leg}_{part}")
+        for link in links:
+            body = model.body(link)
             for geom in range(body.geomadr[0], body.geomadr[0] + body.geomnum[0]):
                 model.geom_matid[geom] = -1
                 model.geom_rgba[geom, :3] = WEAK + 0.5 * strength * (1.0 - WEAK)
@@ -128,14 +131,14 @@ def _progress(dynamics: Dynamics, shift: str, leaf: str) -> float:
     return float(np.clip((getattr(dynamics, leaf) - nominal) / (shifted - nominal), 0.0, 1.0))
 
 
-def describe(shift: str, dynamics: Dynamics, leg_strength: np.ndarray) -> str:
+def describe(shift: str, robot: Robot, dynamics: Dynamics, leg_strength: np.ndarray) -> str:
     """Return the conditions of an episode with their numbers, for a caption; empty if nominal."""
     weakest = int(np.argmin(leg_strength))
     shown = {
         "none": "",
         "bumpy": f"bumps to {100 * float(dynamics.bump_height):.0f} cm",
         "icy": f"friction {float(dynamics.friction):.2g}",
-        "weakened": f"{a1.LEGS[weakest]} leg at {100 * float(leg_strength[weakest]):.0f} %",
+        "weakened": f"{robot.legs[weakest]} leg at {100 * float(leg_strength[weakest]):.0f} %",
         "sloped": f"hill of {math.degrees(float(dynamics.incline)):.2g} deg",
         "gravity": f"gravity {float(dynamics.gravity):.2g} m/s^2",
     }.get(shift, shift)

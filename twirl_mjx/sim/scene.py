@@ -1,4 +1,4 @@
-"""Compose and compile scenes: the A1, the ground of a scene kind, markers and hurdle bands."""
+"""Compose and compile scenes: a robot, the ground of a scene kind, markers and hurdle bands."""
 
 from __future__ import annotations
 
@@ -14,14 +14,20 @@ import mujoco
 import numpy as np
 from mujoco import mjx
 
-from twirl_mjx.sim import a1, look
-from twirl_mjx.sim.dynamics import SceneKind
+from twirl_mjx.sim import look
+from twirl_mjx.sim.dynamics import HILL_ANGLE, SceneKind
+from twirl_mjx.sim.mjcf import robot_spec
+from twirl_mjx.sim.robot import BODY_CLASSES, CALF, CONTROL_DT, FOOT, Robot
+from twirl_mjx.sim.robots import A1
 
 CollisionSet = Literal["feet", "legs", "full"]
 """Robot geoms the contact solver sees: feet; feet and calves; or every collision geom."""
-
-CONTROL_DT = 0.05
-"""s, the policy runs at 20 Hz (paper, section "Actions")."""
+COLLIDING: dict[CollisionSet, tuple[str, ...]] = {
+    "feet": (FOOT,),
+    "legs": (FOOT, CALF),
+    "full": BODY_CLASSES,
+}
+"""Body classes of a collision set."""
 
 HILL_START = 0.5
 """m, x at which the incline of a ``sloped`` scene begins; the robot starts at x = 0."""
@@ -45,6 +51,9 @@ DRAWN_HALF_WIDTH = 1.5
 BUMPY_PIECES = (2, 20)
 """Pieces in x and y of which a band on a heightfield is drawn, each lying on its own ground."""
 
+MESH_ARRAYS = ("mesh_vert", "mesh_normal", "mesh_face")
+"""Arrays of some 100 000 rows in a robot's file, which would make tracing take minutes."""
+
 HeightOf = Callable[[np.ndarray], np.ndarray]
 """Ground height [K] in m under world positions [K, 2]."""
 
@@ -54,11 +63,13 @@ class SimOptions:
     """Physics settings; the defaults were chosen against C MuJoCo at 1 ms (docs/physics.md)."""
 
     sim_dt: float = 0.005
-    """s, physics step; must divide the control step of 0.05 s."""
+    """s, physics step; must divide the control step."""
     iterations: int = 4
     """Newton solver iterations."""
     ls_iterations: int = 8
     """Line-search iterations."""
+    control_dt: float = CONTROL_DT
+    """s, control step; a scene takes its robot's."""
 
     def __post_init__(self) -> None:
         """Check the step.
@@ -66,18 +77,18 @@ class SimOptions:
         Raises:
             ValueError: The physics step does not divide the control step.
         """
-        steps = CONTROL_DT / self.sim_dt if self.sim_dt > 0 else 0.0
+        steps = self.control_dt / self.sim_dt if self.sim_dt > 0 else 0.0
         if steps < 1 or abs(steps - round(steps)) > 1e-6:
-            valid = CONTROL_DT / max(1, round(steps))
+            valid = self.control_dt / max(1, round(steps))
             raise ValueError(
-                f"sim_dt {self.sim_dt} s does not divide the control step of {CONTROL_DT} s"
+                f"sim_dt {self.sim_dt} s does not divide the control step of {self.control_dt} s"
                 f" (nearest: {valid:.6g})"
             )
 
     @property
     def n_substeps(self) -> int:
         """Physics steps in a control step."""
-        return round(CONTROL_DT / self.sim_dt)
+        return round(self.control_dt / self.sim_dt)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -88,7 +99,7 @@ class Bands:
     """m, world x of the centres."""
     y: float = 0.0
     """m, world y of the middle of the drawn part."""
-    incline: float = math.radians(8.0)
+    incline: float = HILL_ANGLE
     """rad, of the hill of a ``sloped`` scene."""
     bump_height: float = 0.05
     """m, of a ``bumpy`` scene."""
@@ -99,6 +110,7 @@ class Scene:
     """A compiled scene, shared by all worlds that differ only in ``Dynamics``."""
 
     kind: SceneKind
+    robot: Robot
     options: SimOptions
     mj_model: mujoco.MjModel
     ground_geoms: tuple[int, ...]
@@ -108,10 +120,12 @@ class Scene:
 
     @functools.cached_property
     def mjx_model(self) -> mjx.Model:
-        """The model on the device."""
+        """The model on the device, without the meshes: they are seen, but nothing meets them."""
         # First asked for inside a trace, it must hold arrays all the same: it is kept.
         with jax.ensure_compile_time_eval():
-            return mjx.put_model(self.mj_model)
+            model = mjx.put_model(self.mj_model)
+        unseen = {name: getattr(model, name)[:0] for name in MESH_ARRAYS} if model.nmesh else {}
+        return model.replace(**unseen)
 
 
 def unit_bumps() -> np.ndarray:
@@ -151,7 +165,7 @@ def _add_ground(spec: mujoco.MjSpec, kind: SceneKind) -> tuple[str, ...]:
     world.add_geom(name="floor", type=plane, size=[0, 0, 0.05], material="ground", **common)
     if kind == "flat":
         return ("floor",)
-    angle = math.radians(8.0)
+    angle = HILL_ANGLE
     # The plane is drawn 24 m long; for contacts it is endless. Both half-spaces unite.
     world.add_geom(
         name="hill",
@@ -203,17 +217,10 @@ def _tilt(slope_x: float, slope_y: float) -> np.ndarray:
     return quat
 
 
-def _enable_collisions(spec: mujoco.MjSpec, collision: CollisionSet) -> None:
-    enabled = {"feet": (a1.FOOT,), "legs": (a1.FOOT, a1.CALF), "full": a1.BODY_CLASSES}[collision]
-    for shape in a1.CONTACT_GEOMS:
-        geom = spec.geom(shape.name)
-        geom.contype = 0
-        geom.conaffinity = int(shape.body in enabled)
-
-
 def build_scene(
     kind: SceneKind = "flat",
     *,
+    robot: Robot = A1,
     collision: CollisionSet = "legs",
     options: SimOptions | None = None,
     goal_marker: bool = False,
@@ -223,20 +230,25 @@ def build_scene(
 
     Args:
         kind: Ground geometry.
+        robot: Who walks on it.
         collision: Robot geoms the contact solver sees.
-        options: Physics settings.
+        options: Physics settings; the control step is the robot's.
         goal_marker: Add a mocap body ``goal`` with a visible, untouchable pole.
         bands: Hurdle bands to draw.
 
     Returns:
         The compiled scene.
+
+    Raises:
+        FileNotFoundError: The robot's MJCF does not exist.
+        ValueError: It is not that of the record, or the physics step does not divide the
+            robot's control step.
     """
-    options = options or SimOptions()
+    options = dataclasses.replace(options or SimOptions(), control_dt=robot.control_dt)
     bumps = unit_bumps() if kind == "bumpy" else np.zeros((1, 1), np.float32)
-    spec = mujoco.MjSpec.from_file(str(a1.xml_path()))
+    spec = robot_spec(robot, COLLIDING[collision])
     look.add_look(spec, kind, bumps)
     ground = _add_ground(spec, kind)
-    _enable_collisions(spec, collision)
     if goal_marker:
         _add_goal_marker(spec)
     spec.option.timestep = options.sim_dt
@@ -248,7 +260,7 @@ def build_scene(
         if kind == "bumpy":  # the compiler has scaled them to the full height
             model.hfield_data[:] = bumps.ravel() * (BUMP_HEIGHT / MAX_BUMP_HEIGHT)
         ids = tuple(model.geom(name).id for name in ground)
-        return Scene(kind=kind, options=options, mj_model=model, ground_geoms=ids, bumps=bumps)
+        return Scene(kind, robot, options, model, ids, bumps)
 
     scene = compiled()
     if bands is None:

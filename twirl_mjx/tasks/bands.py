@@ -7,16 +7,30 @@ radius. Heights are over the local ground, on which the rectangle stands.
 
 from __future__ import annotations
 
+import math
+
 import jax
 import jax.numpy as jnp
+import numpy as np
 
+from twirl_mjx.sim.kinematics import reach_limits
+from twirl_mjx.sim.robot import Robot
 from twirl_mjx.sim.scene import HURDLE_HEIGHT, HURDLE_LENGTH
 
-REACH = 0.7
-"""m in x between the base and the centre of the farthest band a part of the A1 can touch: hip at
-0.183, stretched leg 0.4, foot radius 0.02, half a band 0.1."""
-MIN_GAP = 2 * REACH
-"""m, from this distance between bands on, the robot can only touch the one nearest to its base."""
+
+def reach(robot: Robot) -> float:
+    """Return the distance in m along x to the centre of the farthest band the robot can touch.
+
+    Hip, stretched leg, foot radius and half a band, rounded up to decimetres (A1: 0.7).
+    """
+    hip = float(np.abs(robot.hip_offsets[:, 0]).max())
+    stretched = hip + reach_limits(robot)[1] + robot.foot_radius + HURDLE_LENGTH / 2
+    return math.ceil(10 * stretched) / 10
+
+
+def min_gap(robot: Robot) -> float:
+    """Return the distance in m between bands from which on only the nearest can be touched."""
+    return 2 * reach(robot)
 
 
 def draw(key: jax.Array, count: int, min_gap: float, max_gap: float) -> jax.Array:

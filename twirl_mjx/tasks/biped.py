@@ -1,8 +1,9 @@
 """Task ``biped``: walk to a goal on the hind legs (paper, "Bipedal Navigation Task").
 
-Observation [101]: ``observations.UPRIGHT``. Action [12] in [-1, 1]. Goal: uniform on a circle of
-radius ~ Exp(mean 1.5 m) clipped to [0.3, 5] m. Reward: r_stand (1 + r_facing + r_distance).
-Terminates when trunk, hip or thigh touches the ground (not the calf, README, decision 6).
+Observation: ``observations.proprioceptive`` with axes (A1: [101]). Action [A] in [-1, 1]. Goal:
+uniform on a circle of radius ~ Exp(mean 1.5 m) clipped to [0.3, 5] m.
+Reward: r_stand (1 + r_facing + r_distance). Terminates when trunk, hip or thigh touches the ground
+(not the calf, README, decision 6).
 """
 
 from __future__ import annotations
@@ -16,12 +17,13 @@ import jax
 import jax.numpy as jnp
 
 from twirl_mjx.checks import check_choice, check_range
-from twirl_mjx.sim import a1, frames
+from twirl_mjx.sim import frames
 from twirl_mjx.sim.dynamics import Dynamics
-from twirl_mjx.sim.scene import CONTROL_DT, Scene
+from twirl_mjx.sim.robot import HIP, THIGH, TRUNK
+from twirl_mjx.sim.scene import Scene
 from twirl_mjx.tasks import base, rewards
 from twirl_mjx.tasks.goals import GOAL_OPTIONS, GoalOptions, draw_goal
-from twirl_mjx.tasks.observations import ProprioceptiveObserver
+from twirl_mjx.tasks.observations import Observer, ProprioceptiveObserver
 from twirl_mjx.tasks.registry import register
 from twirl_mjx.tasks.stand import STANDING_MEASURES, STANDING_SUCCESS_S
 from twirl_mjx.tasks.task import Link, Measure, Task
@@ -99,7 +101,10 @@ class Biped(Task[BipedOptions]):
     course_options = GOAL_OPTIONS
     caption = ("cosine", "goal_distance")
     shows_goal = True
-    observer = ProprioceptiveObserver(axes=True)
+
+    def make_observer(self) -> Observer:
+        """Show the goal, the history and the base axes."""
+        return ProprioceptiveObserver(self.robot, axes=True)
 
     def start(self, key: jax.Array, scene: Scene, dynamics: Dynamics) -> base.Start:
         """Start on four feet with a goal."""
@@ -116,7 +121,7 @@ class Biped(Task[BipedOptions]):
 
     def _progress(self, distance: jax.Array, previous: jax.Array) -> jax.Array:
         if self.options.distance_reward == "speed":
-            return rewards.approach_speed(distance, previous, CONTROL_DT)
+            return rewards.approach_speed(distance, previous, self.robot.control_dt)
         return rewards.distance_progress(distance, previous)
 
     def judge(self, world: base.World, view: base.View, scene: Scene) -> base.Outcome:
@@ -128,7 +133,7 @@ class Biped(Task[BipedOptions]):
         facing = rewards.normalised_cosine(rewards.facing_cosine(z_axis, displacement))
         progress = self._progress(distance, world.task.previous_distance)
         weight = self.options.distance_weight
-        fall = base.touches(view, a1.TRUNK, a1.HIP, a1.THIGH)
+        fall = base.touches(view, TRUNK, HIP, THIGH)
         return base.Outcome(
             reward=(upright + bonus) * (1.0 + facing + weight * progress),
             terminated=fall,

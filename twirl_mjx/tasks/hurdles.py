@@ -1,7 +1,7 @@
 """Task ``hurdles``: jump over randomly spaced hurdles (paper, "Jumping Task").
 
-Observation [95]: ``observations.PROPRIOCEPTIVE``. Action [12] in [-1, 1]. Goal: centre of the next
-hurdle; a hurdle is passed when the root is 0.4 m beyond it. Reward: the four terms of ``WEIGHTS``.
+Observation: ``observations.proprioceptive`` (A1: [95]). Action [A] in [-1, 1]. Goal: centre of the
+next hurdle; a hurdle is passed when the root is 0.4 m beyond it. Reward: the terms of ``WEIGHTS``.
 Terminates when any part of the robot touches a hurdle at any physics substep, or the trunk touches
 the ground.
 """
@@ -19,12 +19,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from twirl_mjx.checks import check_choice, check_range
-from twirl_mjx.sim import a1, frames, kinematics
+from twirl_mjx.sim import frames, kinematics
 from twirl_mjx.sim.dynamics import Dynamics
-from twirl_mjx.sim.scene import BUMP_HALF_SIZE, CONTROL_DT, Scene
+from twirl_mjx.sim.robot import FOOT, TRUNK
+from twirl_mjx.sim.scene import BUMP_HALF_SIZE, Scene
 from twirl_mjx.tasks import bands, base, rewards
 from twirl_mjx.tasks.biped import POLISH
-from twirl_mjx.tasks.observations import ProprioceptiveObserver
 from twirl_mjx.tasks.registry import register
 from twirl_mjx.tasks.task import Link, Measure, Task
 
@@ -71,17 +71,18 @@ class Crossing(flax.struct.PyTreeNode):
 def watch(
     scene: Scene, dynamics: Dynamics, qpos_trace: jax.Array, positions: jax.Array
 ) -> Crossing:
-    """Test every physics substep ``qpos_trace`` [S, 19] against hurdles at ``positions`` [H]."""
-    points = kinematics.forward(qpos_trace)
+    """Test every physics substep ``qpos_trace`` [S, 7 + J] against hurdles at ``positions`` [H]."""
+    robot = scene.robot
+    points = kinematics.forward(robot, qpos_trace)
     x = points.endpoints[..., 0]
     height = points.endpoints[..., 2] - base.ground_at(scene, dynamics, points.endpoints[..., :2])
-    radii = jnp.asarray(a1.CONTACT_RADII, jnp.float32)
+    radii = jnp.asarray(robot.contact_radii, jnp.float32)
     band = bands.nearest(positions, qpos_trace[:, 0])
-    feet = np.flatnonzero(base.FEET)
+    feet = np.flatnonzero(robot.contact_mask(FOOT))
     return Crossing(
         hit=jnp.any(bands.shape_distance(x, height, radii, band) <= 0.0),
         stepped_in=bands.stepped_in(
-            positions, x[:, feet, 0], height[:, feet, 0] < a1.FOOT_RADIUS + FOOT_CONTACT
+            positions, x[:, feet, 0], height[:, feet, 0] < robot.foot_radius + FOOT_CONTACT
         ),
         last_foot=jnp.min(x[-1, feet, 0]),
     )
@@ -141,7 +142,7 @@ class HurdlesOptions:
         for name in ("min_gap", "max_gap", "fixed_gap"):
             check_range(f"hurdles.{name}", getattr(self, name), 0.0, 1000.0)
         if self.gap is not None:
-            check_range("hurdles.gap", self.gap, bands.MIN_GAP, 1000.0)
+            check_range("hurdles.gap", self.gap, 0.0, 1000.0)
 
 
 @register
@@ -174,7 +175,6 @@ class Hurdles(Task[HurdlesOptions]):
     )
     course_options = ("min_gap", "max_gap", "fixed_gap", "gap")
     caption = ("hurdles_passed",)
-    observer = ProprioceptiveObserver(axes=False)
 
     def __init__(self, options: HurdlesOptions | None = None, **setting: Any) -> None:
         """Keep the options of the task.
@@ -188,14 +188,15 @@ class Hurdles(Task[HurdlesOptions]):
             low = high = self.options.fixed_gap
         if self.options.gap is not None:
             low = high = self.options.gap
-        if not bands.MIN_GAP <= low <= high:
+        least = bands.min_gap(self.robot)
+        if not least <= low <= high:
             raise ValueError(
                 f"hurdles have gaps from {low} to {high} m: the smallest must be at least"
-                f" {bands.MIN_GAP} m and the largest no smaller"
-                f" (nearest: {max(low, bands.MIN_GAP)} to {max(low, high, bands.MIN_GAP)})"
+                f" {least} m and the largest no smaller"
+                f" (nearest: {max(low, least)} to {max(low, high, least)})"
             )
         self._gaps = (low, high)
-        seconds = self.episode_length * CONTROL_DT
+        seconds = self.episode_length * self.robot.control_dt
         self.num_hurdles = math.ceil(seconds * MAX_SPEED / low) + 1
         """H, never all passed in an episode."""
 
@@ -234,7 +235,7 @@ class Hurdles(Task[HurdlesOptions]):
             "hurdle": bonus(self.options.hurdle_bonus, world.task, state),
         }
         goal = next_goal(state)
-        fall = base.touches(view, a1.TRUNK)
+        fall = base.touches(view, TRUNK)
         return base.Outcome(
             reward=sum((WEIGHTS[name] * term for name, term in terms.items()), jnp.zeros(())),
             terminated=crossing.hit | fall,

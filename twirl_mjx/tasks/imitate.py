@@ -1,8 +1,8 @@
 """Task ``imitate``: track a leap clip (Peng et al. 2020). Source of ``hurdles``.
 
-Observation [160]: ``LAYOUT``. Action [12] in [-1, 1]. Reward: the five terms of ``WEIGHTS`` (paper
-Table 2), 1 for a perfect tracker. Episodes start on the reference at a random phase, with its
-velocities; a share of them starts at rest on four feet instead, as episodes of other tasks do.
+Observation: ``make_layout`` (A1: [160]). Action [A] in [-1, 1]. Reward: the terms of ``WEIGHTS``
+(paper Table 2), 1 for a perfect tracker. Episodes start on the reference at a random phase, at its
+speed; a share of them starts at rest on four feet instead, as episodes of other tasks do.
 Whenever the clip loops, the reference moves to where the robot is (root xy only).
 Terminates when the root is ``max_root_error`` or ``max_root_angle`` away from the reference, or
 trunk, hips, thighs or knees touch the ground. The lower ends of the calves do not count: in the
@@ -15,8 +15,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
-from pathlib import Path
-from typing import Any
 
 import flax.struct
 import jax
@@ -28,11 +26,13 @@ from twirl_mjx.assets import asset_path
 from twirl_mjx.checks import check_range
 from twirl_mjx.motion.clip import Clip, headings, sample
 from twirl_mjx.motion.formats import foot_paths, read_clip
-from twirl_mjx.sim import a1, frames, kinematics
+from twirl_mjx.sim import frames, kinematics
 from twirl_mjx.sim.dynamics import Dynamics
-from twirl_mjx.sim.scene import CONTROL_DT, CollisionSet, Scene
+from twirl_mjx.sim.robot import CONTROL_DT, HIP, ROOT_SIZE, THIGH, TRUNK, Robot
+from twirl_mjx.sim.robots import A1
+from twirl_mjx.sim.scene import CollisionSet, Scene
 from twirl_mjx.tasks import base, rewards
-from twirl_mjx.tasks.observations import HISTORY, Entry
+from twirl_mjx.tasks.observations import HISTORY, Entry, in_history
 from twirl_mjx.tasks.registry import register
 from twirl_mjx.tasks.task import Measure, Task
 
@@ -54,41 +54,39 @@ FLIGHT_STEPS = 4
 STANDING_TOLERANCE = 0.005
 """m, poses whose highest foot is this little above the lowest such pose are as good to start in."""
 
-LAYOUT: tuple[Entry, ...] = (
-    *(
-        Entry(f"{name}[{i - HISTORY + 1}]", size, unit, noise)
-        for i in range(HISTORY)
-        for name, size, unit, noise in (
-            ("base_quat_h", 4, "1", 0.005),  # half an angle of 0.01 rad
-            ("joint_pos", 12, "rad", 0.005),
-            ("previous_action", 12, "1", 0.0),
-        )
-    ),
-    *(
-        Entry(f"target_{name}[+{step}]", size, unit, noise)
-        for step in TARGET_STEPS
-        for name, size, unit, noise in (
-            ("base_displacement_h", 3, "m", 0.01),
-            ("base_quat_h", 4, "1", 0.005),
-            ("joint_pos", 12, "rad", 0.0),  # the reference's own
-        )
-    ),
-)
-"""Layout of the observation, 160 numbers; ``_h``: in the robot's present heading frame (world axes
-turned by its yaw; in the history, by its yaw at that time). Quaternions wxyz with w >= 0."""
+
+def make_layout(robot: Robot) -> tuple[Entry, ...]:
+    """Return the layout of the observation (A1: 160 numbers).
+
+    ``_h``: in the heading frame (world axes turned by the robot's yaw at that time); w >= 0.
+    """
+    tilt = Entry("base_quat_h", 4, "1", 0.005)  # half an angle of 0.01 rad
+    joints = Entry("joint_pos", robot.num_joints, "rad", 0.005)
+    reference = joints._replace(noise=0.0)  # known without sensors
+    target = (Entry("base_displacement_h", 3, "m", 0.01), tilt, reference)
+    return (
+        *in_history((tilt, joints, Entry("previous_action", robot.num_joints, "1"))),
+        *(e._replace(name=f"target_{e.name}[+{i}]") for i in TARGET_STEPS for e in target),
+    )
 
 
-def load_clip(name: str) -> Clip:
+def load_clip(name: str, robot: Robot = A1) -> Clip:
     """Return the clip of a config, turned to face +x on average.
 
     Args:
         name: ``leap`` for the shipped clip, else the path of a clip file.
+        robot: Whose motion it is.
 
     Raises:
         FileNotFoundError: There is no such file.
-        ValueError: The file is not a clip, or its motion does not go on after its last frame.
+        ValueError: The file is no clip, its motion ends, or the shipped clip is another robot's.
     """
-    clip = read_clip(asset_path("a1", "leap.json") if name == "leap" else Path(name))
+    if name == "leap" and robot is not A1:
+        raise ValueError(
+            f"imitate.clip 'leap' is a motion of robot {A1.name!r}, not of {robot.name!r}"
+            " (nearest: the path of a clip file of its own)"
+        )
+    clip = read_clip(asset_path(robot.name, "leap.json") if name == "leap" else name, robot=robot)
     if clip.loop != "wrap":
         raise ValueError(
             f"imitate.clip {name!r} has loop mode {clip.loop!r}, which ends after one cycle;"
@@ -125,10 +123,10 @@ def to_heading(quat: jax.Array, yaw: jax.Array) -> jax.Array:
     return jnp.where(turned[..., :1] < 0.0, -turned, turned)
 
 
-def feet_from_root(qpos: jax.Array) -> jax.Array:
+def feet_from_root(robot: Robot, qpos: jax.Array) -> jax.Array:
     """Return the feet [4, 3] in m relative to the root, in the robot's heading frame."""
     tilt = to_heading(qpos[3:7], frames.yaw(qpos[3:7]))
-    return frames.rotate(tilt, kinematics.foot_positions(qpos[7:]))
+    return frames.rotate(tilt, kinematics.foot_positions(robot, qpos[7:]))
 
 
 class ImitateMemory(flax.struct.PyTreeNode):
@@ -141,12 +139,14 @@ class ImitateMemory(flax.struct.PyTreeNode):
     offset: jax.Array
     """[2] m, added to the clip's root xy."""
     history: jax.Array
-    """[3, 28] the last frames of (base quaternion without yaw, joints, action), oldest first."""
+    """[HISTORY, F] the last frames (quaternion without yaw, joints, action), oldest first."""
+    control_dt: float = flax.struct.field(pytree_node=False, default=CONTROL_DT)
+    """s, control step."""
 
     @property
     def elapsed(self) -> jax.Array:
         """Time in s since the start of the episode."""
-        return self.step * jnp.float32(CONTROL_DT)
+        return self.step * jnp.float32(self.control_dt)
 
 
 class ImitateObserver:
@@ -157,7 +157,9 @@ class ImitateObserver:
 
     def __init__(self, clip: Clip) -> None:
         """Keep a wrapping clip."""
-        self.layout = LAYOUT
+        self.layout = make_layout(clip.robot)
+        self.control_dt = clip.robot.control_dt
+        """s, control step."""
         self.clip = clip.to_arrays()
         self.duration = clip.cycle_duration
         """s, length of a cycle."""
@@ -175,7 +177,8 @@ class ImitateObserver:
             start_time=time,
             step=jnp.zeros((), jnp.int32),
             offset=self._offset(time, qpos),
-            history=jnp.tile(_frame(qpos, jnp.zeros(12, jnp.float32)), (HISTORY, 1)),
+            history=jnp.tile(_frame(qpos, jnp.zeros_like(qpos[ROOT_SIZE:])), (HISTORY, 1)),
+            control_dt=self.control_dt,
         )
 
     def push(
@@ -193,9 +196,9 @@ class ImitateObserver:
     def observe(
         self, memory: ImitateMemory, goal: jax.Array, qpos: jax.Array, qvel: jax.Array
     ) -> jax.Array:
-        """Return [160] numbers in the order of ``LAYOUT``; the goal is not looked at."""
+        """Return the numbers [O] in the order of ``layout``; the goal is not looked at."""
         del goal, qvel
-        times = self.time(memory) + CONTROL_DT * jnp.array(TARGET_STEPS, jnp.float32)
+        times = self.time(memory) + self.control_dt * jnp.array(TARGET_STEPS, jnp.float32)
         target = jax.vmap(lambda time: sample(self.clip, time)[0])(times)
         target = target.at[:, :2].add(memory.offset)
         yaw = frames.yaw(qpos[3:7])
@@ -208,7 +211,7 @@ class ImitateObserver:
         return memory.start_time + memory.elapsed
 
     def reference(self, memory: ImitateMemory) -> tuple[jax.Array, jax.Array]:
-        """Return qpos [19] and qvel [18] of the reference at present."""
+        """Return qpos [7 + J] and qvel [6 + J] of the reference at present."""
         qpos, qvel = sample(self.clip, self.time(memory))
         return qpos.at[:2].add(memory.offset), qvel
 
@@ -223,7 +226,7 @@ class ImitateObserver:
 
 
 def _frame(qpos: jax.Array, action: jax.Array) -> jax.Array:
-    """Return one step of the history [28]."""
+    """Return one step of the history [F]."""
     tilt = to_heading(qpos[3:7], frames.yaw(qpos[3:7]))
     return jnp.concatenate([tilt, qpos[7:], action])
 
@@ -286,15 +289,14 @@ class Imitate(Task[ImitateOptions]):
     caption = ("tracking",)
     observer: ImitateObserver
 
-    def __init__(self, options: ImitateOptions | None = None, **setting: Any) -> None:
+    def make_observer(self) -> ImitateObserver:
         """Load the clip.
 
         Raises:
             FileNotFoundError: The clip of the options does not exist.
             ValueError: It is not a clip, or does not wrap.
         """
-        super().__init__(options, **setting)
-        self.observer = ImitateObserver(load_clip(self.options.clip))
+        return ImitateObserver(load_clip(self.options.clip, self.robot))
 
     def start(self, key: jax.Array, scene: Scene, dynamics: Dynamics) -> base.Start:
         """Start on the reference, or at rest in a share ``standing_fraction`` of the episodes.
@@ -306,7 +308,7 @@ class Imitate(Task[ImitateOptions]):
         xy = base.start_xy(place_key, scene)
         qpos, qvel = sample(self.observer.clip, phase)
         qpos = qpos.at[:2].set(xy).at[2].add(base.ground_at(scene, dynamics, xy))
-        endpoints = kinematics.forward(qpos).endpoints
+        endpoints = kinematics.forward(scene.robot, qpos).endpoints
         lowest = jnp.min(base.clearances(scene, dynamics, endpoints))
         qpos = qpos.at[2].add(jnp.maximum(-lowest, 0.0))
         if self.options.standing_fraction > 0.0:
@@ -339,15 +341,17 @@ class Imitate(Task[ImitateOptions]):
             "velocity": rewards.joint_vel_tracking(qvel[6:] - ref_qvel[6:]),
             "root_pose": rewards.root_tracking(root_error, angle),
             "root_velocity": rewards.root_vel_tracking(qvel[:3] - ref_qvel[:3], spin),
-            "end_effector": rewards.foot_tracking(feet_from_root(qpos) - feet_from_root(ref_qpos)),
+            "end_effector": rewards.foot_tracking(
+                feet_from_root(scene.robot, qpos) - feet_from_root(scene.robot, ref_qpos)
+            ),
         }
         reward = sum((WEIGHTS[name] * term for name, term in terms.items()), jnp.zeros(()))
         distance = jnp.linalg.norm(root_error)
-        fall = base.touches(view, a1.TRUNK, a1.HIP, a1.THIGH) | base.knees_touch(view)
+        fall = base.touches(view, TRUNK, HIP, THIGH) | base.knees_touch(view)
         lost = (distance > options.max_root_error) | (angle > options.max_root_angle)
         airborne = jnp.all(base.foot_clearance(view) > base.LIFTED)
         leaps = self.observer.cycles(world.memory.elapsed)
-        completed = leaps > self.observer.cycles(world.memory.elapsed - CONTROL_DT)
+        completed = leaps > self.observer.cycles(world.memory.elapsed - self.robot.control_dt)
         task = count_flights(world.task, airborne, completed)
         return base.Outcome(
             reward=reward,

@@ -29,7 +29,7 @@ def measures_of(task: Task | type[Task]) -> dict[str, Measure]:
     return COMMON | dict(task.measures)
 
 
-_EMPTY = {"sum": 0.0, "mean": 0.0, "min": jnp.inf, "max": -jnp.inf}
+_EMPTY = {"sum": 0.0, "time": 0.0, "mean": 0.0, "min": jnp.inf, "max": -jnp.inf}
 
 
 class Tracker(flax.struct.PyTreeNode):
@@ -57,7 +57,13 @@ def tracker_step(task: Task, tracker: Tracker, state: Any) -> Tracker:
         "step": jnp.ones_like(state.reward),
         "terminated": state.terminated.astype(jnp.float32),
     }
-    fold = {"sum": jnp.add, "mean": jnp.add, "min": jnp.minimum, "max": jnp.maximum}
+    fold = {
+        "sum": jnp.add,
+        "time": jnp.add,
+        "mean": jnp.add,
+        "min": jnp.minimum,
+        "max": jnp.maximum,
+    }
     values = {
         name: fold[m.how](tracker.values[name], signals[m.signal])
         for name, m in measures_of(task).items()
@@ -73,8 +79,9 @@ def tracker_read(task: Task, tracker: Tracker) -> dict[str, jax.Array]:
     values = {}
     for name, m in measures_of(task).items():
         value = tracker.values[name] / tracker.steps if m.how == "mean" else tracker.values[name]
-        defined = (tracker.steps > 0.0) | (m.how == "sum")
-        values[name] = jnp.where(defined, value * m.scale, jnp.nan)
+        defined = (tracker.steps > 0.0) | (m.how in ("sum", "time"))
+        scale = m.scale * task.robot.control_dt if m.how == "time" else m.scale
+        values[name] = jnp.where(defined, value * scale, jnp.nan)
     return values | {"success": task.success(values).astype(jnp.float32)}
 
 

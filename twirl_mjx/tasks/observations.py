@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from twirl_mjx.sim import frames
+from twirl_mjx.sim.robot import ROOT_SIZE, Robot
 
 HISTORY = 3
 """Control steps in the observation history, oldest first (paper, section "Observations")."""
@@ -30,28 +31,31 @@ class Entry(NamedTuple):
     """Standard deviation of the sensors' noise at ``Dynamics.obs_noise`` 1."""
 
 
-FRAME: tuple[Entry, ...] = (
-    Entry("roll_pitch", 2, "rad", 0.01),
-    Entry("roll_pitch_rate_b", 2, "rad/s", 0.05),
-    Entry("joint_pos", 12, "rad", 0.005),
-    Entry("base_displacement_w", 3, "m", 0.01),
-    Entry("previous_action", 12, "1"),
-)
-"""One step of the proprioceptive history (paper appendix; README, decisions 1 and 2)."""
-FRAME_SIZE = sum(e.size for e in FRAME)
+def frame_layout(robot: Robot) -> tuple[Entry, ...]:
+    """Return one step of the proprioceptive history (paper appendix; README, deviations)."""
+    return (
+        Entry("roll_pitch", 2, "rad", 0.01),
+        Entry("roll_pitch_rate_b", 2, "rad/s", 0.05),
+        Entry("joint_pos", robot.num_joints, "rad", 0.005),
+        Entry("base_displacement_w", 3, "m", 0.01),
+        Entry("previous_action", robot.num_joints, "1"),
+    )
 
-PROPRIOCEPTIVE: tuple[Entry, ...] = (
-    Entry("goal_displacement_w", 2, "m", 0.02),
-    *(e._replace(name=f"{e.name}[{i - HISTORY + 1}]") for i in range(HISTORY) for e in FRAME),
-)
-"""Layout of the hurdles observation, 95 numbers."""
 
-UPRIGHT: tuple[Entry, ...] = (
-    *PROPRIOCEPTIVE,
-    Entry("base_x_axis_w", 3, "1", 0.01),
-    Entry("base_z_axis_w", 3, "1", 0.01),
-)
-"""Layout of the stand and biped observation, 101 numbers."""
+def in_history(frame: tuple[Entry, ...]) -> tuple[Entry, ...]:
+    """Return ``HISTORY`` steps of a frame's layout, named ``[-2]`` to ``[0]``."""
+    steps = range(1 - HISTORY, 1)
+    return tuple(e._replace(name=f"{e.name}[{step}]") for step in steps for e in frame)
+
+
+def proprioceptive(robot: Robot, *, axes: bool) -> tuple[Entry, ...]:
+    """Return the layout of hurdles (A1: 95 numbers), or with ``axes`` of stand and biped (101)."""
+    goal = Entry("goal_displacement_w", 2, "m", 0.02)
+    layout = (goal, *in_history(frame_layout(robot)))
+    if not axes:
+        return layout
+    axis = Entry("base_x_axis_w", 3, "1", 0.01)
+    return (*layout, axis, axis._replace(name="base_z_axis_w"))
 
 
 def layout_slices(layout: tuple[Entry, ...]) -> dict[str, slice]:
@@ -97,29 +101,30 @@ class HistoryMemory(flax.struct.PyTreeNode):
     start_pos: jax.Array
     """[3] m, base position at the start of the episode, world frame."""
     history: jax.Array
-    """[3, 31] the last frames, oldest first."""
+    """[HISTORY, F] the last frames, oldest first."""
 
 
 def proprioceptive_frame(
     qpos: jax.Array, qvel: jax.Array, start_pos: jax.Array, action: jax.Array
 ) -> jax.Array:
-    """Return one step of the history [31] in the order of ``FRAME``."""
+    """Return one step of the history [F] in the order of ``frame_layout``."""
+    joints = qpos[ROOT_SIZE:]
     return jnp.concatenate(
-        [frames.roll_pitch(qpos[3:7]), qvel[3:5], qpos[7:19], qpos[:3] - start_pos, action]
+        [frames.roll_pitch(qpos[3:7]), qvel[3:5], joints, qpos[:3] - start_pos, action]
     )
 
 
 class ProprioceptiveObserver:
     """Goal displacement and a 3-step history; with the base axes for upright tasks."""
 
-    def __init__(self, *, axes: bool) -> None:
-        """Choose the layout: ``UPRIGHT`` with the base axes, else ``PROPRIOCEPTIVE``."""
+    def __init__(self, robot: Robot, *, axes: bool) -> None:
+        """Choose the layout: with the base axes, or without."""
         self._axes = axes
-        self.layout = UPRIGHT if axes else PROPRIOCEPTIVE
+        self.layout = proprioceptive(robot, axes=axes)
 
     def init(self, qpos: jax.Array, qvel: jax.Array) -> HistoryMemory:
         """Fill the history with the first state and no action."""
-        frame = proprioceptive_frame(qpos, qvel, qpos[:3], jnp.zeros(12, qpos.dtype))
+        frame = proprioceptive_frame(qpos, qvel, qpos[:3], jnp.zeros_like(qpos[ROOT_SIZE:]))
         return HistoryMemory(start_pos=qpos[:3], history=jnp.tile(frame, (HISTORY, 1)))
 
     def push(
@@ -132,7 +137,7 @@ class ProprioceptiveObserver:
     def observe(
         self, memory: HistoryMemory, goal: jax.Array, qpos: jax.Array, qvel: jax.Array
     ) -> jax.Array:
-        """Return [95] or [101] numbers in the order of ``layout``."""
+        """Return the numbers [O] in the order of ``layout``."""
         del qvel
         parts = [goal - qpos[:2], memory.history.ravel()]
         if self._axes:

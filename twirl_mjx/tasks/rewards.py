@@ -61,7 +61,7 @@ def orientation(angle: jax.Array) -> jax.Array:
 
 
 def joint_calm(joint_vel: jax.Array) -> jax.Array:
-    """Return exp(-0.1 |qdot|_2) of joint velocities [12] in rad/s (paper, "Joint velocity")."""
+    """Return exp(-0.1 |qdot|_2) of joint velocities [J] in rad/s (paper, "Joint velocity")."""
     return jnp.exp(-0.1 * jnp.linalg.norm(joint_vel))
 
 
@@ -71,12 +71,12 @@ def kernel(weighted_square_error: jax.Array) -> jax.Array:
 
 
 def joint_tracking(error: jax.Array) -> jax.Array:
-    """Return exp(-5 sum dq^2) of joint errors [12] in rad."""
+    """Return exp(-5 sum dq^2) of joint errors [J] in rad."""
     return kernel(5.0 * jnp.sum(error**2))
 
 
 def joint_vel_tracking(error: jax.Array) -> jax.Array:
-    """Return exp(-0.1 sum dqdot^2) of joint velocity errors [12] in rad/s."""
+    """Return exp(-0.1 sum dqdot^2) of joint velocity errors [J] in rad/s."""
     return kernel(0.1 * jnp.sum(error**2))
 
 

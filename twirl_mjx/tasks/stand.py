@@ -1,6 +1,7 @@
 """Task ``stand``: get up on the hind legs and stay there. Source of ``biped``.
 
-Observation [101]: ``observations.UPRIGHT``. Action [12] in [-1, 1]. Reward: r_upright + r_height.
+Observation: ``observations.proprioceptive`` with axes (A1: [101]). Action [A] in [-1, 1].
+Reward: r_upright + r_height.
 Terminates when any part but the feet touches the ground (paper, "Training the source policy").
 A goal is drawn as in ``biped`` and shown, but nothing depends on it: both tasks then share their
 observation, and the source has learned to ignore the goal.
@@ -16,12 +17,13 @@ import jax
 import jax.numpy as jnp
 
 from twirl_mjx.checks import check_choice, check_range
-from twirl_mjx.sim import a1, frames
+from twirl_mjx.sim import frames
 from twirl_mjx.sim.dynamics import Dynamics
-from twirl_mjx.sim.scene import CONTROL_DT, CollisionSet, Scene
+from twirl_mjx.sim.robot import CALF, HIP, THIGH, TRUNK
+from twirl_mjx.sim.scene import CollisionSet, Scene
 from twirl_mjx.tasks import base, rewards
 from twirl_mjx.tasks.goals import GOAL_OPTIONS, GoalOptions, draw_goal
-from twirl_mjx.tasks.observations import ProprioceptiveObserver
+from twirl_mjx.tasks.observations import Observer, ProprioceptiveObserver
 from twirl_mjx.tasks.registry import register
 from twirl_mjx.tasks.task import Measure, Task
 
@@ -34,11 +36,9 @@ STANDING_SUCCESS_S = 12.0
 
 STANDING_MEASURES = {
     "standing_time": Measure(
-        "standing", "sum", CONTROL_DT, "s", "time with c >= 0.7 and both front feet lifted"
+        "standing", "time", 1.0, "s", "time with c >= 0.7 and both front feet lifted"
     ),
-    "on_feet": Measure(
-        "on_feet", "sum", CONTROL_DT, "s", "standing time with no calf on the ground"
-    ),
+    "on_feet": Measure("on_feet", "time", 1.0, "s", "standing time with no calf on the ground"),
     "cosine": Measure("cosine", "mean", 1.0, "1", "mean vertical part of the base x-axis"),
 }
 """What is measured of a robot that should be on its hind legs."""
@@ -82,7 +82,10 @@ class Stand(Task[StandOptions]):
     course_options = (*GOAL_OPTIONS, "risen_fraction")
     training_options = ("risen_fraction",)
     caption = ("cosine",)
-    observer = ProprioceptiveObserver(axes=True)
+
+    def make_observer(self) -> Observer:
+        """Show the goal, the history and the base axes."""
+        return ProprioceptiveObserver(self.robot, axes=True)
 
     def start(self, key: jax.Array, scene: Scene, dynamics: Dynamics) -> base.Start:
         """Start on four feet, or part-way up in a share ``risen_fraction`` of the episodes."""
@@ -90,9 +93,10 @@ class Stand(Task[StandOptions]):
         qpos, qvel = base.start_on_feet(pose_key, scene, dynamics)
         if self.options.risen_fraction > 0.0:
             pitch = jax.random.uniform(pitch_key, maxval=RISEN_PITCH_DEG * jnp.pi / 180)
-            risen = base.risen_pose(pitch)
+            risen = base.risen_pose(scene.robot, pitch)
             risen = risen.at[:2].set(qpos[:2])
-            risen = risen.at[7:].add(qpos[7:] - jnp.asarray(a1.DEFAULT_POSE, jnp.float32))
+            pose = jnp.asarray(scene.robot.default_pose, jnp.float32)
+            risen = risen.at[7:].add(qpos[7:] - pose)
             risen = base.place_on_ground(scene, dynamics, risen)
             take = jax.random.uniform(risen_key) < self.options.risen_fraction
             qpos = jnp.where(take, risen, qpos)
@@ -107,10 +111,10 @@ class Stand(Task[StandOptions]):
     def judge(self, world: base.World, view: base.View, scene: Scene) -> base.Outcome:
         """Score one control step."""
         cosine = frames.base_axes(view.qpos[3:7])[0][2]
-        front = jnp.mean(base.foot_clearance(view)[jnp.asarray(a1.FRONT_LEGS)]) + a1.FOOT_RADIUS
+        front = jnp.mean(base.front_feet(view)) + view.robot.foot_radius
         height = view.height if self.options.height_of == "root" else front
         upright, bonus = rewards.normalised_cosine(cosine), rewards.height_bonus(height)
-        fall = base.touches(view, a1.TRUNK, a1.HIP, a1.THIGH, a1.CALF)
+        fall = base.touches(view, TRUNK, HIP, THIGH, CALF)
         return base.Outcome(
             reward=upright + bonus,
             terminated=fall,

@@ -15,11 +15,13 @@ import jax
 import numpy as np
 
 from twirl_mjx.sim.dynamics import Dynamics
+from twirl_mjx.sim.robot import Robot
+from twirl_mjx.sim.robots import DEFAULT_ROBOT
 from twirl_mjx.sim.scene import CollisionSet, Scene
 from twirl_mjx.tasks.base import Outcome, Start, View, World
-from twirl_mjx.tasks.observations import Observer
+from twirl_mjx.tasks.observations import Observer, ProprioceptiveObserver
 
-How = Literal["sum", "mean", "min", "max"]
+How = Literal["sum", "time", "mean", "min", "max"]
 
 
 class Measure(NamedTuple):
@@ -28,7 +30,7 @@ class Measure(NamedTuple):
     signal: str
     """``reward``, ``step`` (1 each step), ``terminated``, or a metric of the task."""
     how: How
-    """Fold over the steps of the episode."""
+    """Fold over the steps of the episode; ``time`` is the sum times the control step, in s."""
     scale: float = 1.0
     """Factor on the folded value."""
     unit: str = "1"
@@ -86,12 +88,18 @@ class Task[O]:
     """What the policy sees."""
 
     def __init__(
-        self, options: O | None = None, *, fixed_course: bool = False, episode_length: int = 400
+        self,
+        options: O | None = None,
+        *,
+        robot: Robot = DEFAULT_ROBOT,
+        fixed_course: bool = False,
+        episode_length: int = 400,
     ) -> None:
         """Keep the options.
 
         Args:
             options: Of the task's own ``Options``; its defaults when not given.
+            robot: Whose observations it shows; its scene holds the same robot.
             fixed_course: Whether goals and hurdles stand at fixed places (dynamics shifts).
             episode_length: Control steps of the longest episode.
 
@@ -101,8 +109,14 @@ class Task[O]:
         options = self.Options() if options is None else options
         self.check_options(options)
         self.options: O = options  # type: ignore[assignment]
+        self.robot = robot
         self.fixed_course = fixed_course
         self.episode_length = episode_length
+        self.observer = self.make_observer()
+
+    def make_observer(self) -> Observer:
+        """Return what the policy sees: goal and a 3-step history, unless a task says otherwise."""
+        return ProprioceptiveObserver(self.robot, axes=False)
 
     def start(self, key: jax.Array, scene: Scene, dynamics: Dynamics) -> Start:
         """Draw the first state of an episode."""

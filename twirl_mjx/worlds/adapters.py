@@ -26,7 +26,7 @@ FRAME_SIZE = (480, 640)
 class GymnasiumEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     """One world of a task as a ``gymnasium.Env``.
 
-    Observation: float32 [O] in the task's layout. Action: float32 [12] in [-1, 1]. ``info`` has
+    Observation: float32 [O] in the task's layout. Action: float32 [A] in [-1, 1]. ``info`` has
     one float per name of the task's metrics (every reward term, unweighted) and the bool
     ``invalid``. A step that is not finite is reported as a truncation with ``invalid`` true,
     reward 0 and the previous observation.
@@ -71,7 +71,7 @@ class GymnasiumEnv(gymnasium.Env[np.ndarray, np.ndarray]):
 
         Raises:
             gymnasium.error.ResetNeeded: No episode is running.
-            ValueError: ``action`` has another shape than [12].
+            ValueError: ``action`` has another shape than [A].
         """
         if self._state is None:
             raise ResetNeeded("no episode is running: call reset() first")

@@ -11,10 +11,11 @@ import tyro
 from twirl_mjx.checks import check_choice, check_range
 from twirl_mjx.sim.dynamics import LEAVES, SHIFTS, Dynamics, make_dynamics
 from twirl_mjx.sim.ranges import Ranges, parse_ranges
+from twirl_mjx.sim.robots import DEFAULT_ROBOT, ROBOTS
 from twirl_mjx.tasks.registry import TASKS
 from twirl_mjx.tasks.task import Task
 
-REGISTRIES = (TASKS, SHIFTS)
+REGISTRIES = (TASKS, SHIFTS, ROBOTS)
 """What a config may name that can come from a user's own file."""
 
 DynamicsOverrides: Any = dataclasses.make_dataclass(
@@ -45,6 +46,8 @@ class WorldConfig:
     """Name of the task, or file.py:Name of your own."""
     options: Any = None
     """Options of the task, of its own kind; the defaults when not given."""
+    robot: str = DEFAULT_ROBOT.name
+    """Name of the robot, or file.py:NAME of your own."""
     shift: str = "none"
     """Dynamics shift, by name, or file.py:NAME of your own."""
     shift_strength: float = 1.0
@@ -74,6 +77,7 @@ class WorldConfig:
             for registry in REGISTRIES:
                 registry.admit_if_fits(reference)
         self._set("task", TASKS.admit(self.task))
+        self._set("robot", ROBOTS.admit(self.robot))
         self._set("shift", SHIFTS.admit(self.shift))
         self._set("uses", self._references())
         self.make_dynamics()
@@ -92,7 +96,11 @@ class WorldConfig:
         object.__setattr__(self, name, value)
 
     def _references(self) -> tuple[str, ...]:
-        found = [TASKS.reference(self.task), SHIFTS.reference(self.shift)]
+        found = [
+            TASKS.reference(self.task),
+            ROBOTS.reference(self.robot),
+            SHIFTS.reference(self.shift),
+        ]
         return tuple(sorted({*self.uses, *(f for f in found if f)}))
 
     @property
@@ -137,7 +145,10 @@ class WorldConfig:
             FileNotFoundError: A file that they name does not exist.
         """
         return self.task_type(
-            self.options, fixed_course=self.fixed_course, episode_length=self.episode_length
+            self.options,
+            robot=ROBOTS.get(self.robot),
+            fixed_course=self.fixed_course,
+            episode_length=self.episode_length,
         )
 
 

@@ -47,7 +47,7 @@ def _bind(
     threads: int | None = None,
 ) -> VectorEnv:
     kind = scene_kind or get_shift(config.shift).scene
-    scene = build_scene(kind, collision=task.collision, options=SimOptions())
+    scene = build_scene(kind, robot=task.robot, collision=task.collision, options=SimOptions())
     return VectorEnv(
         task,
         scene,

@@ -14,7 +14,7 @@ from twirl_mjx.sim import actuation
 from twirl_mjx.sim.dynamics import Dynamics, broadcast, leaf_value
 from twirl_mjx.sim.engine import Engine, Trace, make_data, world_model
 from twirl_mjx.sim.ranges import NO_RANGES, Ranges, draw
-from twirl_mjx.sim.scene import CONTROL_DT, Scene
+from twirl_mjx.sim.scene import Scene
 from twirl_mjx.tasks.base import Outcome, World, make_view
 from twirl_mjx.tasks.observations import layout_noise, layout_size
 from twirl_mjx.tasks.task import Task
@@ -111,12 +111,12 @@ class VectorEnv:
     @property
     def action_size(self) -> int:
         """A, one action per joint."""
-        return 12
+        return self.scene.robot.num_joints
 
     @property
     def control_dt(self) -> float:
         """Control step in s."""
-        return CONTROL_DT
+        return self.scene.robot.control_dt
 
     @functools.cached_property
     def mj_model(self) -> mujoco.MjModel:
@@ -164,17 +164,18 @@ class VectorEnv:
 
         Args:
             state: The present state.
-            action: [N, 12], clipped to [-1, 1].
+            action: [N, A], clipped to [-1, 1].
 
         Raises:
             ValueError: ``action`` has another shape.
         """
-        if jnp.shape(action) != (self.num_envs, 12):
-            raise ValueError(f"action has shape {jnp.shape(action)}, need ({self.num_envs}, 12)")
+        need = (self.num_envs, self.action_size)
+        if jnp.shape(action) != need:
+            raise ValueError(f"action has shape {jnp.shape(action)}, need {need}")
         finite_action = jnp.all(jnp.isfinite(action), axis=-1)
         action = jnp.clip(jnp.nan_to_num(action.astype(jnp.float32)), -1.0, 1.0)
         world, command = jax.vmap(self._command)(state.world, state.data.ctrl, action)
-        pushed = state.data.replace(qvel=jax.vmap(_push)(world, state.data.qvel))
+        pushed = state.data.replace(qvel=jax.vmap(self._push)(world, state.data.qvel))
         data, trace = self.engine.step(pushed, command, world.dynamics)
         world, next_obs, outcome, finite = jax.vmap(self._judge_world)(world, command, trace)
         invalid = ~(finite & finite_action)
@@ -208,7 +209,7 @@ class VectorEnv:
         world = World(
             key=key,
             episode_step=jnp.zeros((), jnp.int32),
-            action=jnp.zeros(12),
+            action=jnp.zeros(self.action_size),
             filter=actuation.filter_init(start.qpos[7:]),
             motors=actuation.motor_init(motor_key, dynamics),
             dynamics=dynamics,
@@ -222,15 +223,28 @@ class VectorEnv:
     def _command(
         self, world: World, previous: jax.Array, action: jax.Array
     ) -> tuple[World, actuation.MotorCommand]:
-        """Turn an action into the motors' command; ``previous`` [12] is the last target in rad."""
-        desired = actuation.action_to_target(action)
-        target, filter_state = actuation.filter_step(world.filter, desired)
-        command = actuation.motor_command(world.motors, target, world.dynamics)
+        """Turn an action into the motors' command; ``previous`` [J] is the last target in rad."""
+        robot = self.scene.robot
+        desired = actuation.action_to_target(robot, action)
+        target, filter_state = actuation.filter_step(robot, world.filter, desired)
+        command = actuation.motor_command(robot, world.motors, target, world.dynamics)
         options = self.scene.options
         command = actuation.delay(
             command, previous, world.dynamics, options.sim_dt, options.n_substeps
         )
         return world.replace(filter=filter_state, action=action), command
+
+    def _push(self, world: World, qvel: jax.Array) -> jax.Array:
+        """Return ``qvel`` with the push that is due, every ``push_interval`` of the episode."""
+        if world.dynamics.push is None:
+            return qvel
+        interval = leaf_value(world.dynamics, "push_interval") / self.control_dt
+        steps = jnp.maximum(jnp.round(interval), 1.0).astype(jnp.int32)
+        due = (world.episode_step > 0) & (world.episode_step % steps == 0)
+        # direction = U(0, 2 pi)
+        angle = jax.random.uniform(_key_now(world, PUSH), maxval=2 * jnp.pi)
+        impulse = world.dynamics.push * jnp.stack([jnp.cos(angle), jnp.sin(angle)])
+        return qvel.at[:2].add(jnp.where(due, impulse, 0.0))
 
     def _sense(self, world: World, obs: jax.Array) -> jax.Array:
         """Return the observation [O] with the sensors' noise of this instant."""
@@ -247,7 +261,7 @@ class VectorEnv:
         memory = self.task.observer.push(world.memory, view.qpos, view.qvel, world.action)
         world = world.replace(
             memory=memory,
-            motors=actuation.motor_heat(world.motors, world.dynamics, torque, CONTROL_DT),
+            motors=actuation.motor_heat(world.motors, world.dynamics, torque, self.control_dt),
             episode_step=world.episode_step + 1,
         )
         outcome = self.task.judge(world, view, self.scene)
@@ -273,19 +287,6 @@ class VectorEnv:
 def _key_now(world: World, stream: int) -> jax.Array:
     """Return the key of a stream of draws in this control step of the episode."""
     return jax.random.fold_in(jax.random.fold_in(world.key, stream), world.episode_step)
-
-
-def _push(world: World, qvel: jax.Array) -> jax.Array:
-    """Return ``qvel`` with the push that is due, every ``push_interval`` of the episode."""
-    if world.dynamics.push is None:
-        return qvel
-    interval = leaf_value(world.dynamics, "push_interval") / CONTROL_DT
-    steps = jnp.maximum(jnp.round(interval), 1.0).astype(jnp.int32)
-    due = (world.episode_step > 0) & (world.episode_step % steps == 0)
-    # direction = U(0, 2 pi)
-    angle = jax.random.uniform(_key_now(world, PUSH), maxval=2 * jnp.pi)
-    impulse = world.dynamics.push * jnp.stack([jnp.cos(angle), jnp.sin(angle)])
-    return qvel.at[:2].add(jnp.where(due, impulse, 0.0))
 
 
 def _select[T](mask: jax.Array, new: T, old: T) -> T:
