@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from twirl_mjx.policies.learned import load_policy as load_policy
+    from twirl_mjx.sim.dynamics import Shift as Shift
+    from twirl_mjx.sim.robot import Robot as Robot
     from twirl_mjx.tasks.base import Outcome as Outcome
     from twirl_mjx.tasks.base import Start as Start
     from twirl_mjx.tasks.task import Measure as Measure
@@ -26,7 +28,9 @@ __version__ = "0.2.0"
 _HOMES = {
     "Measure": "twirl_mjx.tasks.task",
     "Outcome": "twirl_mjx.tasks.base",
+    "Robot": "twirl_mjx.sim.robot",
     "RunResult": "twirl_mjx.training.api",
+    "Shift": "twirl_mjx.sim.dynamics",
     "Start": "twirl_mjx.tasks.base",
     "Task": "twirl_mjx.tasks.task",
     "WorldConfig": "twirl_mjx.worlds.config",

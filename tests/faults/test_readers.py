@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from twirl_mjx import cli, config_json, exits
+from twirl_mjx import cli, exits
 from twirl_mjx.assets import asset_path
 from twirl_mjx.deploy.export import export_onnx
 from twirl_mjx.figures.plots import make_figures
@@ -19,8 +19,10 @@ from twirl_mjx.motion.formats import read_clip
 from twirl_mjx.policies.learned import load_policy
 from twirl_mjx.sweep import gather, plan
 from twirl_mjx.sweep.plan import Cell
-from twirl_mjx.training import loop, metrics, rundir
+from twirl_mjx.training import config_json
 from twirl_mjx.training.config import TrainConfig
+from twirl_mjx.training.rundir import Foreign, RunDir
+from twirl_mjx.training.sinks.table import truncate_csv
 
 CURVE = "run,task,shift,variant,seed,metric,env_steps,grad_steps,wall_s,value\n"
 EPISODE = "run,task,shift,variant,seed,env_steps,episode,metric,value\n"
@@ -32,21 +34,23 @@ def check_run(path: Path) -> None:
     (path.parent / "config.json").exists() or (path.parent / "config.json").write_text(
         config_json.to_json(TrainConfig())
     )
-    rundir.check_run(path.parent, TrainConfig(), {"origin": "o", "digest": "d"})
+    match RunDir(path.parent).status(TrainConfig(), {"origin": "o", "digest": "d"}):
+        case Foreign(error):
+            raise error
 
 
 READERS: dict[str, tuple[str, Callable[[Path], object]]] = {
     "policy": ("policy.npz", load_policy),
     "onnx": ("policy.onnx", load_policy),
     "clip": ("clip.json", read_clip),
-    "config": ("config.json", lambda path: rundir.read_config(path.parent)),
+    "config": ("config.json", lambda path: RunDir(path.parent).read_config()),
     "resumed config": ("config.json", check_run),
     "source": ("source.json", check_run),
-    "evaluation": ("eval.csv", lambda path: loop.finished(path.parent, 1)),
+    "evaluation": ("eval.csv", lambda path: RunDir(path.parent).finished()),
     "steps": ("eval.csv", lambda path: plan.evaluated_steps(path.parent)),
-    "episodes": ("eval.csv", lambda path: gather.episode_rows(CELL, path.parents[1], ())),
-    "curves": ("metrics.csv", lambda path: gather.curve_rows(CELL, path.parents[1], ())),
-    "resumed metrics": ("metrics.csv", lambda path: metrics.truncate_csv(path, 10)),
+    "episodes": ("eval.csv", lambda path: gather.episode_rows(CELL, path.parents[1])),
+    "curves": ("metrics.csv", lambda path: gather.curve_rows(CELL, path.parents[1])),
+    "resumed metrics": ("metrics.csv", lambda path: truncate_csv(path, 10)),
     "table": ("table.csv", read_table),
 }
 GROWS = ("resumed metrics",)

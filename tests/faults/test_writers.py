@@ -27,8 +27,9 @@ from twirl_mjx.motion.leap_plan import make_layout
 from twirl_mjx.policies.learned import NumpyPolicy, load_policy, save_policy
 from twirl_mjx.replay import dataset
 from twirl_mjx.sweep.gather import write_table
-from twirl_mjx.training import loop, metrics, rundir
+from twirl_mjx.training import metrics
 from twirl_mjx.training.config import TrainConfig
+from twirl_mjx.training.rundir import RunDir
 from twirl_mjx.types import Transition
 
 FRAMES = [np.random.default_rng(i).integers(0, 255, (64, 64, 3), np.uint8) for i in range(20)]
@@ -81,6 +82,10 @@ def cut_metrics(path: Path) -> None:
     metrics.truncate_csv(path, 5)
 
 
+def write_episodes(path: Path) -> None:
+    RunDir(path.parent).write_episodes(TrainConfig(), 1, {"m": np.zeros(3)})
+
+
 WRITERS: dict[str, Callable[[Path], object]] = {
     "policy.npz": lambda path: save_policy(path, shipped().actor_params, shipped().header),
     "source.npz": rows,
@@ -93,13 +98,13 @@ WRITERS: dict[str, Callable[[Path], object]] = {
     "clip.json": lambda path: write_clip(clip(), path),
     "plan.json": plan,
     "report.html": lambda path: report(path),
-    "eval.csv": lambda path: loop.write_episodes(path, {"run": "a"}, 1, {"m": np.zeros(3)}),
     "evaluation.csv": lambda path: evaluate.write_rows(path, [["a"] * 9]),
     "table.csv": lambda path: write_table(path, ["# n"], ["value"], [{"value": "1"}]),
     "bench.json": lambda path: files.write_json(path, {"a": 1.0}),
 }
 OTHERS: dict[str, Callable[[Path], object]] = {
-    "config.json": lambda path: rundir.open_run(path.parent, TrainConfig()),
+    "eval.csv": write_episodes,
+    "config.json": lambda path: RunDir(path.parent).open(TrainConfig()),
     "metrics.csv": cut_metrics,
 }
 """Writers that choose their own file, or read it first."""

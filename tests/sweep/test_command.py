@@ -146,7 +146,7 @@ def test_a_cell_of_another_sweep_is_left_to_it(
     first, *others = make_plan(load(str(grid_file)), runs)
     cells = {cell.name: cell for cell in (first, *others)}
     other_sweep = contextlib.ExitStack()
-    other_sweep.enter_context(rundir.exclusive(runs / first.name))
+    other_sweep.enter_context(rundir.RunDir(runs / first.name).exclusive())
     started: list[str] = []
 
     class Executor(here_executor):

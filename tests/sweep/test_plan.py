@@ -14,6 +14,7 @@ from twirl_mjx.sweep.grid import Draft, load
 from twirl_mjx.sweep.plan import Cell, make_plan, status_of
 from twirl_mjx.training import rundir, source_rules
 from twirl_mjx.training.presets import make_config
+from twirl_mjx.training.rundir import RunDir
 
 Finish = Callable[..., Path]
 
@@ -96,13 +97,6 @@ def test_a_source_may_have_a_scripted_source_itself(tmp_path: Path) -> None:
     assert hurdles.needs == (imitate.name,)
 
 
-def test_file_names_are_those_of_training() -> None:
-    from twirl_mjx.training.loop import EVAL_CSV
-    from twirl_mjx.training.sinks.table import CSV_NAME
-
-    assert (plan.EVAL_CSV, plan.METRICS_CSV) == (EVAL_CSV, CSV_NAME)
-
-
 def test_identity_is_the_resolved_config(tmp_path: Path) -> None:
     def name(draft: Draft) -> str:
         return list(resolve(draft, tmp_path))[-1]
@@ -135,10 +129,10 @@ def test_status(tmp_path: Path, finish_run: Finish) -> None:
     assert status_of(cell, tmp_path) == "missing"
     run_dir = finish_run(cell, tmp_path, steps=cell.config.total_env_steps - 1)
     assert status_of(cell, tmp_path) == "cut off"  # closed at a smaller budget
-    with rundir.exclusive(run_dir):
+    with RunDir(run_dir).exclusive():
         assert status_of(cell, tmp_path) == "in use"
     finish_run(cell, tmp_path)
-    with rundir.exclusive(run_dir):
+    with RunDir(run_dir).exclusive():
         assert status_of(cell, tmp_path) == "in use"  # its last files are being written
     assert status_of(cell, tmp_path) == "finished"
     assert status_of(nominal, tmp_path) == "missing"
@@ -201,12 +195,12 @@ def test_reached_steps_reads_the_last_whole_row(tmp_path: Path) -> None:
 
 
 def test_a_run_directory_has_one_owner(tmp_path: Path) -> None:
-    assert rundir.owner(tmp_path) is None
-    with rundir.exclusive(tmp_path):
-        assert "process" in (rundir.owner(tmp_path) or "")
+    assert RunDir(tmp_path).owner() is None
+    with RunDir(tmp_path).exclusive():
+        assert "process" in (RunDir(tmp_path).owner() or "")
         with (
             pytest.raises(rundir.RunBusyError, match=r"in use by process \d+"),
-            rundir.exclusive(tmp_path, wait_s=0.0),
+            RunDir(tmp_path).exclusive(wait_s=0.0),
         ):
             pass
-    assert rundir.owner(tmp_path) is None
+    assert RunDir(tmp_path).owner() is None

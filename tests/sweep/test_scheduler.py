@@ -137,7 +137,7 @@ BUSY_TRAIN = (
     "from twirl_mjx.training import rundir\n"
     "class Train:\n"
     "    def main(self, argv):\n"
-    "        with rundir.exclusive(Path(argv[0]), wait_s=0.0):\n"
+    "        with rundir.RunDir(argv[0]).exclusive(wait_s=0.0):\n"
     "            return 0\n"
     "cli._import_command = lambda name: Train()\n"
     "sys.exit(cli.main(['train', sys.argv[1]]))"
@@ -146,7 +146,7 @@ BUSY_TRAIN = (
 
 def test_a_run_that_another_process_holds_is_told_from_a_crash(tmp_path: Path) -> None:
     job = Job("a", ("-c", BUSY_TRAIN, str(tmp_path / "run")), str(tmp_path / "a.log"))
-    with rundir.exclusive(tmp_path / "run"):
+    with rundir.RunDir(tmp_path / "run").exclusive():
         assert run_job(job, pin=False).code == exits.BUSY
     assert run_job(job, pin=False).code == 0
     crash = Job("a", ("-S", "-c", FAIL), job.log)

@@ -16,8 +16,8 @@ import pytest
 
 from twirl_mjx.sim.dynamics import Dynamics, broadcast, make_dynamics
 from twirl_mjx.sim.ranges import NO_RANGES, Ranges, draw, parse_ranges
-from twirl_mjx.tasks import vector
-from twirl_mjx.tasks.observations import UPRIGHT, layout_noise, layout_slices
+from twirl_mjx.sim.robots import A1
+from twirl_mjx.tasks.observations import layout_noise, layout_slices, proprioceptive
 from twirl_mjx.worlds.vector import EnvState, VectorEnv
 
 LIMIT = 400
@@ -52,6 +52,7 @@ class Conditions:
             num_envs=N,
             episode_length=LIMIT,
             dynamics=make_dynamics("icy"),
+            metric_names=plain.metric_names,
             ranges=ranges,
         )
         self.reset = jax.jit(functools.partial(self.env.reset, jax.random.key(5)))
@@ -180,7 +181,10 @@ def test_ranges_without_effect_in_the_scene_are_refused(worlds: Callable[..., An
 
 
 def test_noise_of_every_entry_by_hand() -> None:
-    noise, at = layout_noise(UPRIGHT), layout_slices(UPRIGHT)
+    noise, at = (
+        layout_noise(proprioceptive(A1, axes=True)),
+        layout_slices(proprioceptive(A1, axes=True)),
+    )
     assert noise.shape == (101,)
     for name, expected in (
         ("goal_displacement_w", 0.02),
@@ -202,7 +206,7 @@ def test_noise_is_on_what_the_policy_sees_and_on_nothing_else(
     noisy = made.reset(conditions({"obs_noise": [0.0, 1.0, 2.0]}))
     clean = made.reset(conditions({}))
     seen, true = [noisy, *made.run(noisy, taken)], [clean, *made.run(clean, taken)]
-    deviation = layout_noise(UPRIGHT)
+    deviation = layout_noise(proprioceptive(A1, axes=True))
     units = []
     for a, b in zip(seen, true, strict=True):
         np.testing.assert_array_equal(a.data.qpos, b.data.qpos)
@@ -229,7 +233,7 @@ def test_a_push_comes_every_interval(made: Conditions, actions: Callable[..., np
         conditions({"push": [0.5, 0.5, 0.0], "push_interval": [0.2, 0.3, 0.2]})
     ).world
     velocity = jnp.ones((N, 18))
-    pushed = jax.jit(jax.vmap(vector._push))
+    pushed = jax.jit(jax.vmap(made.env._push))
     for step in range(13):
         now = world.replace(episode_step=jnp.full(N, step, jnp.int32))
         change = np.asarray(pushed(now, velocity) - velocity)
@@ -238,7 +242,7 @@ def test_a_push_comes_every_interval(made: Conditions, actions: Callable[..., np
         assert (change[:, 2:] == 0.0).all()
     keys = jax.random.split(jax.random.key(2), 2000)
     one = jax.tree.map(lambda leaf: leaf[0], world).replace(episode_step=jnp.int32(4))
-    many = jax.jit(jax.vmap(lambda key: vector._push(one.replace(key=key), jnp.zeros(18))))(keys)
+    many = jax.jit(jax.vmap(lambda key: made.env._push(one.replace(key=key), jnp.zeros(18))))(keys)
     np.testing.assert_allclose(np.linalg.norm(many, axis=1), 0.5, rtol=1e-5)
     assert np.abs(np.asarray(many).mean(axis=0)).max() < 0.03  # from all around
     taken = actions(5, N)

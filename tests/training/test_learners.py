@@ -20,10 +20,12 @@ from twirl_mjx.droq.learner import LEARNER
 from twirl_mjx.droq.state import AdamState, adam_init, adam_step
 from twirl_mjx.policies.learned import load_policy
 from twirl_mjx.replay import ring
-from twirl_mjx.tasks.registry import make_env
-from twirl_mjx.training import learners, loop, state, weights
+from twirl_mjx.training import config_json, learners, loop, state, weights
 from twirl_mjx.training.config import TrainConfig
+from twirl_mjx.training.presets import make_config
+from twirl_mjx.training.rundir import RunDir
 from twirl_mjx.types import Learner, MetricInfo, Transition
+from twirl_mjx.worlds.make import make_env
 
 
 @dataclasses.dataclass(frozen=True)
@@ -85,15 +87,17 @@ CLONE = Learner(
 @pytest.fixture
 def clone() -> Iterator[Learner]:
     yield learners.register(CLONE)
-    del learners.LEARNERS[CloneConfig]
+    learners.LEARNERS._items.pop("clone")
 
 
 @pytest.fixture
-def clone_config(stand_config: TrainConfig) -> TrainConfig:
+def clone_config(clone: Learner, stand_config: TrainConfig) -> TrainConfig:
     """Every minibatch comes from the source: 64 transitions, 4 updates each, after the warm-up."""
     replay = dataclasses.replace(stand_config.replay, phi=1.0)
     settings: Any = CloneConfig()
-    return dataclasses.replace(stand_config, variant="twirl", replay=replay, droq=settings)
+    return dataclasses.replace(
+        stand_config, variant="twirl", replay=replay, learner="clone", droq=settings
+    )
 
 
 def constant_source(size: int, action: float) -> ring.RingBuffer:
@@ -108,7 +112,7 @@ def constant_source(size: int, action: float) -> ring.RingBuffer:
 def test_a_learner_of_its_own_trains_a_run_to_its_end(
     clone: Learner, clone_config: TrainConfig, tmp_path: Path
 ) -> None:
-    outcome = loop.train(clone_config, tmp_path / "run", source=constant_source(200, 0.5))
+    outcome = loop.train(clone_config, RunDir(tmp_path / "run"), source=constant_source(200, 0.5))
     assert outcome.finished
     with (tmp_path / "run" / "metrics.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
@@ -125,7 +129,7 @@ def test_a_learner_of_its_own_trains_a_run_to_its_end(
 def test_the_compiled_epoch_uses_the_learner_of_the_settings(
     clone: Learner, clone_config: TrainConfig
 ) -> None:
-    env = make_env(clone_config, training=True, threads=1)
+    env = make_env(clone_config, threads=1)
     source = constant_source(200, 0.5)
     begin = jax.jit(lambda key: state.init(clone_config, env, key, None))(jax.random.key(0))
     begin = begin.replace(replay=begin.replay.replace(source=source))
@@ -140,6 +144,16 @@ def test_the_compiled_epoch_uses_the_learner_of_the_settings(
     assert "critic_loss" not in metrics
 
 
+def test_a_run_of_another_learner_is_read_back(clone: Learner) -> None:
+    config = make_config("stand", "debug", "clone")
+    assert (config.learner, type(config.droq)) == ("clone", CloneConfig)
+    assert config_json.from_json(config_json.to_json(config)) == config
+    changed = config_json.settle(config, {"clone.learning_rate": 0.5})
+    assert changed.droq.learning_rate == 0.5
+    with pytest.raises(ValueError, match="learner droq has settings of DroqConfig"):
+        dataclasses.replace(config, learner="droq")
+
+
 def test_the_class_of_the_settings_decides_who_learns(clone: Learner) -> None:
     assert learners.learner_of(CloneConfig()) is CLONE
     assert learners.learner_of(DroqConfig()) is LEARNER
@@ -151,7 +165,8 @@ def test_the_class_of_the_settings_decides_who_learns(clone: Learner) -> None:
 def test_networks_of_another_learner_are_not_taken_over(
     clone: Learner, clone_config: TrainConfig
 ) -> None:
-    config = dataclasses.replace(clone_config, task="biped", variant="weights")
+    config = make_config("biped", "debug", "clone")
+    config = dataclasses.replace(config, variant="weights")
     with pytest.raises(ValueError, match="networks of droq, not those of learner clone"):
         weights.check_weights_fit(config, "debug")
 

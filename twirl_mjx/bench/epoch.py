@@ -17,7 +17,15 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from twirl_mjx.bench.measure import Chain, Record, machine, progress, sample_rates, summary
+from twirl_mjx.bench.measure import (
+    DEFAULT_TASK,
+    Chain,
+    Record,
+    machine,
+    progress,
+    sample_rates,
+    summary,
+)
 from twirl_mjx.checks import check_choice, check_range
 from twirl_mjx.droq import learner as droq
 from twirl_mjx.droq.config import DroqConfig
@@ -47,7 +55,7 @@ class EpochBench:
     """Print one JSON document on stdout, and nothing else."""
     seconds: float = 24.0
     """Length of all measurements together in s, without compilation."""
-    task: str = "stand"
+    task: str = DEFAULT_TASK
     """Task."""
     preset: str = "cpu"
     """Sizes: paper, cpu or debug."""

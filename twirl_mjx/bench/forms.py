@@ -14,7 +14,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from twirl_mjx.bench.measure import Record, machine, progress
+from twirl_mjx.bench.measure import DEFAULT_TASK, Record, machine, progress
 from twirl_mjx.checks import check_choice, check_range
 from twirl_mjx.tasks.registry import TASKS
 from twirl_mjx.training import seeds
@@ -38,7 +38,7 @@ class FormsBench:
 
     json: bool = False
     """Print one JSON document on stdout, and nothing else."""
-    task: str = "stand"
+    task: str = DEFAULT_TASK
     """Task, trained from scratch."""
     preset: str = "cpu"
     """Sizes: paper, cpu or debug."""

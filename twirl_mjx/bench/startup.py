@@ -17,7 +17,7 @@ import time
 from pathlib import Path
 
 from twirl_mjx import files
-from twirl_mjx.bench.measure import Record, machine, progress
+from twirl_mjx.bench.measure import DEFAULT_TASK, Record, machine, progress
 from twirl_mjx.checks import check_choice, check_range
 from twirl_mjx.tasks.registry import TASKS
 from twirl_mjx.training.presets import PRESETS, make_config
@@ -31,7 +31,7 @@ class StartupBench:
 
     json: bool = False
     """Print one JSON document on stdout, and nothing else."""
-    task: str = "stand"
+    task: str = DEFAULT_TASK
     """Task, trained from scratch."""
     preset: str = "cpu"
     """Sizes: paper, cpu or debug."""

@@ -22,6 +22,7 @@ import numpy as np
 from mujoco import mjx
 
 from twirl_mjx.bench.measure import (
+    DEFAULT_TASK,
     Chain,
     Record,
     available_cpus,
@@ -59,7 +60,7 @@ class WorldsBench:
     """Physics engine."""
     num_envs: tuple[int, ...] = (1, 16, 128, 1024)
     """Numbers of worlds stepped together."""
-    task: str = "stand"
+    task: str = DEFAULT_TASK
     """Task."""
 
     def __post_init__(self) -> None:

@@ -53,8 +53,8 @@ class AllBench:
     """Time for everything; a part that is not done by then is stopped and reported so."""
     seconds: float | None = None
     """Length of the measurements of learner, worlds and epoch each, in s; their own by default."""
-    task: str = "stand"
-    """Task of worlds, start-up and epoch."""
+    task: str | None = None
+    """Task of worlds, start-up and epoch; their own by default."""
     preset: str = "cpu"
     """Sizes of start-up and epoch: paper, cpu or debug."""
     out: Path = Path("runs/bench.json")
@@ -142,7 +142,7 @@ def part_arguments(name: str, options: AllBench) -> list[str]:
     words = ["--json"]
     if options.seconds is not None and name != "startup":
         words += ["--seconds", str(options.seconds)]
-    if name != "learner":
+    if name != "learner" and options.task is not None:
         words += ["--task", options.task]
     if name in ("startup", "epoch"):
         words += ["--preset", options.preset]

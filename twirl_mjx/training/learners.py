@@ -34,6 +34,12 @@ def accept(item: Any) -> Learner:
             f"learner {item.name}: {kind.__name__} should be a frozen dataclass with defaults"
             f" for {', '.join(READ)}" + (f"; it has no {', '.join(missing)}" if missing else "")
         )
+    for other in map(LEARNERS.get, LEARNERS.names()):
+        if other.Config is kind and other is not item:
+            raise ValueError(
+                f"learner {item.name}: {kind.__name__} holds the settings of learner"
+                f" {other.name}; derive a class of its own"
+            )
     return item
 
 
