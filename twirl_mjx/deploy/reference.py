@@ -27,7 +27,7 @@ FALL_PARTS = {
     "biped": ("trunk", "head", "hip", "thigh"),
     "hurdles": ("trunk", "head"),
 }
-"""Parts of the robot whose ground contact ends an episode (README, decisions 6 and 9)."""
+"""Parts of the robot whose ground contact ends an episode (README, "Deviations and decisions")."""
 
 
 class Reading(NamedTuple):

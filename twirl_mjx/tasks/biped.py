@@ -3,7 +3,7 @@
 Observation: ``observations.proprioceptive`` with axes (A1: [101]). Action [A] in [-1, 1]. Goal:
 uniform on a circle of radius ~ Exp(mean 1.5 m) clipped to [0.3, 5] m.
 Reward: r_stand (1 + r_facing + r_distance). Terminates when trunk, hip or thigh touches the ground
-(not the calf, README, decision 6).
+(not the calf: the paper's baseline scoots on its knees).
 """
 
 from __future__ import annotations
