@@ -11,7 +11,7 @@ def main(argv: list[str]) -> int:
     """Train to the budget; see ``training.pipeline``."""
     options = parse_train(argv)
     run_dir = pipeline.run(
-        options.config, options.preset, options.runs, options.name, say, options.log
+        options.config, options.preset, options.runs, options.name, say, sinks=options.log
     )
     say(f"done: {run_dir} (policy.npz, metrics.csv, eval.csv); film it: twirl render {run_dir}")
     return 0
