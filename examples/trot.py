@@ -1,6 +1,6 @@
 """A task of your own in one file: trot to a goal on four feet.
 
-twirl train --task examples/trot.py:Trot --source trot --trot.speed 0.5
+twirl train --task examples/trot.py:Trot --variant twirl --source trot --trot.speed 0.5
 """
 
 import dataclasses
