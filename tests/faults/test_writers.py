@@ -82,10 +82,6 @@ def cut_metrics(path: Path) -> None:
     metrics.truncate_csv(path, 5)
 
 
-def write_episodes(path: Path) -> None:
-    RunDir(path.parent).write_episodes(TrainConfig(), 1, {"m": np.zeros(3)})
-
-
 WRITERS: dict[str, Callable[[Path], object]] = {
     "policy.npz": lambda path: save_policy(path, shipped().actor_params, shipped().header),
     "source.npz": rows,
@@ -103,7 +99,6 @@ WRITERS: dict[str, Callable[[Path], object]] = {
     "bench.json": lambda path: files.write_json(path, {"a": 1.0}),
 }
 OTHERS: dict[str, Callable[[Path], object]] = {
-    "eval.csv": write_episodes,
     "config.json": lambda path: RunDir(path.parent).open(TrainConfig()),
     "metrics.csv": cut_metrics,
 }
