@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import io
 import os
 from collections.abc import Mapping
 from pathlib import Path
@@ -80,16 +79,20 @@ def truncate_csv(path: Path, env_steps: int, *, closes_again: bool = False) -> t
         ``wall_s`` and transitions of the last row kept, 0 without rows.
 
     Raises:
-        ValueError: the file has other columns.
+        ValueError: the file has other columns, or a damaged row before its last.
     """
-    with path.open(newline="") as file:
-        text = file.read()
-    whole = text[: text.rfind("\n") + 1]  # a row without its line end was being written
-    rows = list(csv.reader(io.StringIO(whole, newline="")))
+    what = f"a metrics table with columns {','.join(COLUMNS)}"
+    rows = files.read_rows(
+        path, what, {"env_steps": int, "wall_s": files.number_text}, growing=True
+    )
     if rows and tuple(rows[0]) != COLUMNS:
-        raise ValueError(f"{path} has columns {rows[0]}, expected {list(COLUMNS)}")
-    kept = [row for row in rows[1:] if len(row) == len(COLUMNS) and int(row[6]) <= env_steps]
+        raise ValueError(f"{path} has columns {list(rows[0])}, expected {list(COLUMNS)}")
+    kept = [row for row in rows if row["env_steps"] <= env_steps]
     if closes_again:
-        kept = [r for r in kept if int(r[6]) < env_steps or not r[5].startswith(FINAL)]
-    files.write_csv(path, [COLUMNS, *kept])
-    return (float(kept[-1][8]), int(kept[-1][6])) if kept else (0.0, 0)
+        kept = [
+            row
+            for row in kept
+            if row["env_steps"] < env_steps or not row["metric"].startswith(FINAL)
+        ]
+    files.write_csv(path, [COLUMNS, *(list(row.values()) for row in kept)])
+    return (float(kept[-1]["wall_s"]), kept[-1]["env_steps"]) if kept else (0.0, 0)
