@@ -65,15 +65,15 @@ def replacing(path: str | Path) -> Iterator[Path]:
     mark = f".twirl-{zlib.crc32(target.name.encode(errors='surrogateescape')):08x}"
     temporary = target.with_name(f"{mark}-{os.getpid()}-{secrets.token_hex(3)}{Path(path).suffix}")
     try:
-        _make_folders(target.parent)
+        make_folders(target.parent)
         _sweep(target.parent, mark)
         os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
         yield temporary
-        _sync(temporary)
+        sync(temporary)
         with contextlib.suppress(FileNotFoundError):
             os.chmod(temporary, stat.S_IMODE(target.stat().st_mode))
         os.replace(temporary, target)
-        _sync(target.parent)
+        sync(target.parent)
     except BaseException as error:
         with contextlib.suppress(OSError):
             temporary.unlink(missing_ok=True)
@@ -110,9 +110,14 @@ def write_json(path: str | Path, record: Any) -> None:
 
 def write_csv(path: str | Path, rows: Iterable[Sequence[object]], notes: str = "") -> None:
     """Write rows, the header first, after ``notes``; whole or not at all."""
+    write_text(path, notes + csv_text(rows))
+
+
+def csv_text(rows: Iterable[Sequence[object]]) -> str:
+    """Return rows as the text of a CSV table."""
     text = io.StringIO()
     csv.writer(text, lineterminator="\n").writerows(rows)
-    write_text(path, notes + text.getvalue())
+    return text.getvalue()
 
 
 def check_target(path: str | Path) -> Path:
@@ -132,15 +137,15 @@ def check_target(path: str | Path) -> Path:
     return target
 
 
-def _make_folders(folder: Path) -> None:
+def make_folders(folder: Path) -> None:
     """Make a folder and those above it, and force their entries to disk."""
     made = [f for f in (folder, *folder.parents) if not f.exists()]
     folder.mkdir(parents=True, exist_ok=True)
     for new in made:
-        _sync(new.parent)
+        sync(new.parent)
 
 
-def _sync(path: Path) -> None:
+def sync(path: Path) -> None:
     """Force a file, or the entries of a folder, to disk; what a file system cannot is left out."""
     if path.is_dir() and os.name != "posix":
         return

@@ -30,7 +30,7 @@ CELL = Cell("a", "arm", "debug", TrainConfig(), "auto")
 
 
 def check_run(path: Path) -> None:
-    (path.parent / "checkpoints").mkdir(exist_ok=True)
+    (path.parent / "checkpoints" / "orbax" / "1").mkdir(parents=True, exist_ok=True)
     (path.parent / "config.json").exists() or (path.parent / "config.json").write_text(
         config_json.to_json(TrainConfig())
     )

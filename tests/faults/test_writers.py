@@ -27,9 +27,9 @@ from twirl_mjx.motion.leap_plan import make_layout
 from twirl_mjx.policies.learned import NumpyPolicy, load_policy, save_policy
 from twirl_mjx.replay import dataset
 from twirl_mjx.sweep.gather import write_table
-from twirl_mjx.training import metrics
 from twirl_mjx.training.config import TrainConfig
 from twirl_mjx.training.rundir import RunDir
+from twirl_mjx.training.sinks import table
 from twirl_mjx.types import Transition
 
 FRAMES = [np.random.default_rng(i).integers(0, 255, (64, 64, 3), np.uint8) for i in range(20)]
@@ -77,13 +77,9 @@ def report(path: Path) -> None:
 
 def cut_metrics(path: Path) -> None:
     if not path.exists() or path.read_text() == "old":
-        lines = [",".join(metrics.COLUMNS), ",".join("abcd0m") + ",1,1,0.5,2"]
+        lines = [",".join(table.COLUMNS), ",".join("abcd0m") + ",1,1,0.5,2"]
         path.write_text("\n".join(lines) + "\n")
-    metrics.truncate_csv(path, 5)
-
-
-def write_episodes(path: Path) -> None:
-    RunDir(path.parent).write_episodes(TrainConfig(), 1, {"m": np.zeros(3)})
+    table.truncate_csv(path, 5)
 
 
 WRITERS: dict[str, Callable[[Path], object]] = {
@@ -103,7 +99,6 @@ WRITERS: dict[str, Callable[[Path], object]] = {
     "bench.json": lambda path: files.write_json(path, {"a": 1.0}),
 }
 OTHERS: dict[str, Callable[[Path], object]] = {
-    "eval.csv": write_episodes,
     "config.json": lambda path: RunDir(path.parent).open(TrainConfig()),
     "metrics.csv": cut_metrics,
 }

@@ -78,6 +78,28 @@ def test_resumed_run_equals_whole_run_bit_for_bit(
     assert_identical(a, b)
 
 
+def test_a_run_goes_on_from_the_checkpoint_before_a_damaged_one(
+    stand_config: TrainConfig,
+    whole_run: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    run_dir = tmp_path / "stepped"
+    often = dataclasses.replace(stand_config, checkpoint_minutes=0.0)
+    assert train(often, run_dir).env_steps == 96
+    (run_dir / "eval.csv").unlink()
+    damaged = next((run_dir / "checkpoints" / "orbax" / "96" / "train_state" / "d").iterdir())
+    content = bytearray(damaged.read_bytes())
+    content[len(content) // 2] ^= 1
+    damaged.write_bytes(content)
+    capsys.readouterr()
+    assert train(often, run_dir).env_steps == 96
+    said = "".join(capsys.readouterr().out.split())
+    assert f"{damaged}isdamaged" in said
+    assert "resumingsteppedat64transitions" in said
+    assert_identical(final_state(stand_config, whole_run), final_state(often, run_dir))
+
+
 def test_run_directory_is_complete(stand_config: TrainConfig, whole_run: Path) -> None:
     for name in ("config.json", "versions.json", "metrics.csv", "eval.csv", "policy.npz"):
         assert (whole_run / name).is_file(), name

@@ -253,7 +253,10 @@ def test_a_refused_run_leaves_its_name_free(biped: TrainConfig, runs: Path, tmp_
     run_dir.open(config)
     assert run_dir.status(biped) == rundir.New()
     run_dir.open(biped)
-    run_dir.metrics.touch()
+    (run_dir.path / "checkpoints" / "replay").mkdir(parents=True)  # a start that failed later
+    run_dir.metrics.write_text("header\n")
+    assert run_dir.status(config) == rundir.New()
+    run_dir.metrics.write_text("header\na row\n")
     status = run_dir.status(config)
     assert isinstance(status, rundir.Foreign)
     assert "num_critics: 2 -> 3" in str(status.error)

@@ -82,7 +82,7 @@ def given_nominals(paths: Sequence[Path]) -> dict[str, Path]:
     for path in paths:
         run_dir = RunDir(path)
         config = run_dir.read_config()
-        if config.shift != "none" or not run_dir.episodes.is_file():
+        if config.shift != "none" or not run_dir.finished():
             raise ValueError(f"{path} is not a finished run without a shift")
         if config.task in found:
             raise ValueError(
@@ -157,7 +157,7 @@ def _adoptable(draft: Draft, runs: Path) -> str | None:
     plain = make_config(draft.config.task, draft.preset)
     same = dataclasses.replace(plain, seed=draft.config.seed, variant=draft.config.variant)
     run_dir = RunDir(runs / rundir.default_name(same, draft.preset))
-    if draft.config != same or not run_dir.episodes.is_file():
+    if draft.config != same or not run_dir.finished():
         return None
     found = run_dir.read_config()
     free = tuple(set(rundir.may_change(same)) - {"total_env_steps:", "source:"})
@@ -183,11 +183,8 @@ def run_name(config: TrainConfig) -> str:
 
 def evaluated_steps(run_dir: Path) -> int | None:
     """Return the transitions at which a run was closed by its final evaluation, None if not."""
-    path = RunDir(run_dir).episodes
-    if not path.is_file():
-        return None
-    rows = files.read_rows(path, "the evaluation of a run", {"env_steps": int})
-    return rows[0]["env_steps"] if rows else None
+    done = RunDir(run_dir).finished()
+    return done.env_steps if done else None
 
 
 def reached_steps(run_dir: Path) -> int:

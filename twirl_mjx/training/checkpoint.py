@@ -5,6 +5,10 @@ run needs to go on bit for bit. The online ring would dominate both wall time an
 checkpoint only writes the rows inserted since the last one (``checkpoints/replay``), and rows the
 ring has overwritten are deleted. The frozen source ring is not stored: it is read again from its
 dataset.
+
+A checkpoint counts once its manifest is written, which is last (``manifests``): rows, state,
+manifest, each forced to disk before the next. Then what is no longer needed goes, in the opposite
+order. A damaged checkpoint is stepped over.
 """
 
 from __future__ import annotations
@@ -19,7 +23,10 @@ import jax.numpy as jnp
 import numpy as np
 import orbax.checkpoint as ocp
 
-from twirl_mjx import array_files
+from twirl_mjx import array_files, files
+from twirl_mjx.policies.learned import BEST_POLICY
+from twirl_mjx.training import manifests
+from twirl_mjx.training.manifests import DamagedError
 from twirl_mjx.training.state import TrainState
 
 KEEP = 2
@@ -84,24 +91,32 @@ class Checkpoints:
 
     def __init__(self, run_dir: Path) -> None:
         """Open (and create) ``run_dir/checkpoints``; leftovers of a killed save are deleted."""
+        self._run_dir = run_dir
         self._root = (run_dir / "checkpoints").resolve()
         self._replay = self._root / "replay"
-        self._replay.mkdir(parents=True, exist_ok=True)
-        for folder in self._root.glob("orbax/*.orbax-checkpoint-tmp*"):  # left by a killed save
+        files.make_folders(self._replay)
+        manifests.begin(self._root)
+        self.stepped_over: str | None = None
+        """What :meth:`restore` found damaged and where it went on from, as a line."""
+        cut_short = set(manifests.stored(self._root)) - set(manifests.visible(self._root))
+        for folder in (
+            *self._root.glob("orbax/*.orbax-checkpoint-tmp*"),
+            *(manifests.folder_of(self._root, step) for step in cut_short),
+        ):
             shutil.rmtree(folder)
         for file in self._replay.glob("*.partial"):
             file.unlink()
         self._manager = ocp.CheckpointManager(
             self._root / "orbax",
             item_names=("policy", "train_state", "progress"),
-            options=ocp.CheckpointManagerOptions(
-                max_to_keep=KEEP, create=True, enable_async_checkpointing=False
+            options=ocp.CheckpointManagerOptions(  # all are kept here: a save prunes once sealed
+                max_to_keep=None, create=True, enable_async_checkpointing=False
             ),
         )
 
     def latest(self) -> int | None:
         """Return the env steps of the newest checkpoint, None without one."""
-        return self._manager.latest_step()
+        return newest_checkpoint(self._run_dir)
 
     def save(self, state: TrainState, progress: dict[str, Any]) -> None:
         """Write a checkpoint; a second save at the same env steps does nothing.
@@ -111,7 +126,7 @@ class Checkpoints:
             progress: JSON-able facts of the Python loop (best score, wall time, ...).
         """
         step = int(state.env_steps)
-        if step in self._manager.all_steps():
+        if step in manifests.visible(self._root):
             return
         kept = self.latest()
         try:
@@ -120,10 +135,10 @@ class Checkpoints:
             at = "no checkpoint yet" if kept is None else f"the checkpoint at {kept:,} transitions"
             error.add_note(f"saved: {at}")
             raise
-        self._prune(state)
+        self._prune(state.replay.online.capacity)
 
     def _write(self, step: int, state: TrainState, progress: dict[str, Any]) -> None:
-        """Write the rows, then the rest."""
+        """Write the rows, then the state, then the manifest."""
         self._append_rows(state)
         bare = state.replace(replay=state.replay.replace(source=None, online=_bare(state)))
         self._manager.save(
@@ -135,19 +150,48 @@ class Checkpoints:
             ),
         )
         self._manager.wait_until_finished()
+        total = int(state.inserted)
+        begin = total - state.replay.online.capacity
+        rows = [path for _, end, path in _segments(self._replay) if end > begin]
+        manifests.seal(self._root, step, total, rows)
 
     def restore(self, template: TrainState) -> tuple[TrainState, dict[str, Any]]:
-        """Return the newest checkpoint as a state shaped like ``template``, and its progress.
+        """Return the newest good checkpoint as a state shaped like ``template``, and its progress.
 
-        The source ring is taken from ``template``.
+        Damaged ones are stepped over: ``stepped_over`` says so, and they are deleted, since the
+        run will write them again. The source ring is taken from ``template``.
 
         Raises:
             FileNotFoundError: There is none.
-            ValueError: It does not fit the template, or rows of the replay log are missing.
+            DamagedError: None is whole; nothing is deleted.
+            ValueError: It does not fit the template.
         """
-        step = self.latest()
-        if step is None:
+        steps = manifests.visible(self._root)
+        if not steps:
             raise FileNotFoundError(f"no checkpoint in {self._root}")
+        damage: list[str] = []
+        for step in reversed(steps):
+            try:
+                manifests.check(self._root, step)
+                found = self._read(step, template)
+            except DamagedError as error:
+                damage.append(str(error))
+                continue
+            if damage:
+                for bad in steps[steps.index(step) + 1 :]:
+                    self._delete(bad)
+                self.stepped_over = (
+                    f"{damage[0]}; going on from the checkpoint before it, at {step:,} transitions"
+                )
+            return found
+        raise DamagedError(
+            f"{damage[0]}; no checkpoint of {self._run_dir} is whole, so it cannot go on. Give"
+            " another --name; its policy can start that run: --variant weights --source"
+            f" {self._run_dir / BEST_POLICY}"
+        )
+
+    def _read(self, step: int, template: TrainState) -> tuple[TrainState, dict[str, Any]]:
+        """Return one checkpoint."""
         bare = template.replace(replay=template.replay.replace(source=None, online=_bare(template)))
         flat = _abstract(bare)
         found = self._manager.restore(
@@ -169,9 +213,10 @@ class Checkpoints:
         """Write the online rows inserted since the last checkpoint."""
         total = int(state.inserted)
         capacity = state.replay.online.capacity
+        latest = self.latest()
+        logged = 0 if latest is None else self._logged(latest)
         for first, _, path in _segments(self._replay):  # left by a run that died after writing them
-            latest = self.latest()
-            if latest is None or first >= self._logged(latest):
+            if first >= logged:
                 path.unlink()
         stored = max([end for _, end, _ in _segments(self._replay)], default=0)
         first = max(stored, total - capacity)
@@ -183,10 +228,8 @@ class Checkpoints:
 
     def _logged(self, step: int) -> int:
         """Return how many rows had been inserted at a checkpoint."""
-        found = self._manager.restore(
-            step, args=ocp.args.Composite(progress=ocp.args.JsonRestore())
-        )
-        return int(found["progress"]["inserted"])
+        sealed = manifests.inserted_at(self._root, step)
+        return _inserted(self._manager, step) if sealed is None else sealed
 
     def _read_rows(self, state: TrainState, template: TrainState) -> Any:
         """Rebuild the online ring from the log."""
@@ -198,12 +241,25 @@ class Checkpoints:
             rows[np.arange(first, first + len(part)) % capacity] = part
         return state.replay.online.replace(rows=jnp.asarray(rows))
 
-    def _prune(self, state: TrainState) -> None:
-        """Delete rows that no kept checkpoint needs."""
-        oldest = min(self._logged(step) for step in self._manager.all_steps())
+    def _prune(self, capacity: int) -> None:
+        """Delete all but the newest checkpoints, then the rows that none of those needs."""
+        steps = manifests.visible(self._root)
+        for step in steps[:-KEEP]:
+            self._delete(step)
+        oldest = min(self._logged(step) for step in steps[-KEEP:])
         for _, end, path in _segments(self._replay):
-            if end <= oldest - state.replay.online.capacity:
+            if end <= oldest - capacity:
                 path.unlink()
+
+    def _delete(self, step: int) -> None:
+        manifests.forget(self._root, step)
+        self._manager.delete(step)
+
+
+def _inserted(manager: ocp.CheckpointManager, step: int) -> int:
+    """Return how many rows had been inserted, as the state of a checkpoint tells."""
+    found = manager.restore(step, args=ocp.args.Composite(progress=ocp.args.JsonRestore()))
+    return int(found["progress"]["inserted"])
 
 
 def _segments(folder: Path) -> list[tuple[int, int, Path]]:
@@ -242,27 +298,30 @@ def _bare(state: TrainState) -> Any:
     return state.replay.online.replace(rows=jnp.zeros((0, 0), jnp.float32))
 
 
-def _open(run_dir: Path) -> tuple[ocp.CheckpointManager, int]:
-    root = (run_dir / "checkpoints" / "orbax").resolve()
-    manager = (
-        ocp.CheckpointManager(root, item_names=("policy", "train_state", "progress"))
-        if root.is_dir()
-        else None
-    )
-    step = manager.latest_step() if manager is not None else None
-    if manager is None or step is None:
-        raise FileNotFoundError(f"{run_dir} has no checkpoint: its train state is needed here")
-    return manager, step
-
-
 def has_checkpoint(run_dir: Path) -> bool:
     """Return whether a run can be resumed; nothing is created."""
-    try:
-        manager, _ = _open(run_dir)
-    except FileNotFoundError:
-        return False
-    manager.close()
-    return True
+    return newest_checkpoint(run_dir) is not None
+
+
+def newest_checkpoint(run_dir: Path) -> int | None:
+    """Return the env steps of a run's newest checkpoint, None without one; nothing is created."""
+    return max(manifests.visible((run_dir / "checkpoints").resolve()), default=None)
+
+
+def _open(run_dir: Path) -> tuple[ocp.CheckpointManager, int]:
+    """Return the manager of a run and the step of its newest checkpoint, checked.
+
+    Raises:
+        FileNotFoundError: The run has no checkpoint.
+        DamagedError: The newest is damaged. An older one would be another source.
+    """
+    root = (run_dir / "checkpoints").resolve()
+    steps = manifests.visible(root)
+    if not steps:
+        raise FileNotFoundError(f"{run_dir} has no checkpoint: its train state is needed here")
+    manifests.check(root, steps[-1])
+    items = ("policy", "train_state", "progress")
+    return ocp.CheckpointManager(root / "orbax", item_names=items), steps[-1]
 
 
 def load_learner(run_dir: Path) -> dict[str, Any]:
@@ -270,6 +329,7 @@ def load_learner(run_dir: Path) -> dict[str, Any]:
 
     Raises:
         FileNotFoundError: The run has no checkpoint.
+        DamagedError: The newest is damaged.
     """
     manager, step = _open(run_dir)
     flat = manager.restore(step, args=ocp.args.Composite(train_state=ocp.args.StandardRestore()))[
@@ -299,12 +359,12 @@ def load_replay(run_dir: Path, capacity: int) -> np.ndarray:
 
     Raises:
         FileNotFoundError: The run has no checkpoint or no stored experience.
+        DamagedError: The newest checkpoint is damaged.
         ValueError: Rows of the replay log are missing.
     """
     manager, step = _open(run_dir)
-    found = manager.restore(step, args=ocp.args.Composite(progress=ocp.args.JsonRestore()))
+    total = _inserted(manager, step)
     manager.close()
-    total = int(found["progress"]["inserted"])
     folder = run_dir / "checkpoints" / "replay"
     if not _segments(folder):
         raise FileNotFoundError(f"{run_dir} has no stored experience")

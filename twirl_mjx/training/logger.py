@@ -48,6 +48,8 @@ class RunLogger:
         for sink in (table, TensorBoard(), self._terminal):
             sink.open(run)
             self._open.append(sink)
+        if table.lacks:
+            self.announce(table.lacks)
         self._each_chosen(lambda sink: sink.open(run))
         self._start = time.monotonic() - table.earlier_s
         self._compile_s = self._aside_s = 0.0

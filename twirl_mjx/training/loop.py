@@ -28,6 +28,7 @@ from twirl_mjx.training.logger import RunLogger
 from twirl_mjx.training.rundir import RunDir
 from twirl_mjx.training.signals import stop_on_signal
 from twirl_mjx.training.sinks.base import RunInfo, Sink
+from twirl_mjx.training.sinks.table import FINAL
 from twirl_mjx.training.state import TrainState
 from twirl_mjx.types import Learner, MetricInfo
 from twirl_mjx.worlds.make import make_env
@@ -245,30 +246,29 @@ def train(
         with stop_on_signal() as stop, RunLogger(run.info(), sinks) as logger:
             if steps:
                 logger.announce(f"resuming {run_dir.name} at {steps:,} transitions")
+            if run.checkpoints.stepped_over:
+                logger.announce(run.checkpoints.stepped_over)
             train_state = run.loop(train_state, logger, stop)
             steps = int(train_state.env_steps)
             if steps < config.total_env_steps:
                 logger.announce(f"stopped at {steps:,} transitions; the same command resumes")
                 return Outcome(False, steps, {})
             with logger.aside("final evaluation ..."):
-                final = final_evaluation(config, run_dir, steps)
-            logger.log(
-                steps,
-                int(train_state.learner.grad_steps),
-                {f"eval/final_{k}": v for k, v in final.items()},
-            )
+                values = final_evaluation(config, run_dir)
+            final = episode_means(values)
+            last = {FINAL + name: value for name, value in final.items()}
+            logger.log(steps, int(train_state.learner.grad_steps), last)
+            run_dir.write_episodes(config, steps, values)  # last: it says that the run is finished
             return Outcome(True, steps, final)
     finally:
         run.close()
 
 
-def final_evaluation(config: TrainConfig, run_dir: RunDir, env_steps: int) -> dict[str, float]:
-    """Evaluate the best policy of a run on fresh seeds and write ``eval.csv``."""
+def final_evaluation(config: TrainConfig, run_dir: RunDir) -> dict[str, np.ndarray]:
+    """Evaluate the best policy of a run on fresh seeds; return measures [E]."""
     policy = load_policy(run_dir.policy)
     assert isinstance(policy, NumpyPolicy), "a run writes .npz policies"
     actor = jax.tree.map(jnp.asarray, dict(policy.actor_params))
     env = make_env(config.evaluation, num_envs=config.eval.final_episodes)
     evaluate = make_evaluate(env, no_memory, act_mean(learner_of(config.droq)))
-    values = evaluate(actor, jax.random.key(config.eval.seed + 1))
-    run_dir.write_episodes(config, env_steps, values)
-    return episode_means(values)
+    return evaluate(actor, jax.random.key(config.eval.seed + 1))

@@ -202,7 +202,7 @@ def no_such_source(path: Path, runs_dir: Path) -> str:
 def _nominal_run(config: TrainConfig, preset: str, runs_dir: Path) -> RunDir:
     """Return the finished run of the same task and preset without a shift."""
     run_dir = _nominal_dir(config, preset, runs_dir)
-    if run_dir.episodes.is_file():
+    if run_dir.finished():
         return run_dir
     closed = runs_dir.glob(f"{config.task}-*/{run_dir.episodes.name}")
     others = ", ".join(sorted(path.parent.name for path in closed))

@@ -15,6 +15,7 @@ import subprocess
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -22,7 +23,7 @@ from twirl_mjx import exits, files
 from twirl_mjx.policies.learned import BEST_POLICY, LAST_POLICY
 from twirl_mjx.tasks.measures import episode_means
 from twirl_mjx.training import config_json
-from twirl_mjx.training.checkpoint import has_checkpoint
+from twirl_mjx.training.checkpoint import has_checkpoint, newest_checkpoint
 from twirl_mjx.training.config import TrainConfig
 
 PACKAGES = (
@@ -35,8 +36,12 @@ so far. (``source`` is judged by its digest.)"""
 EVAL_COLUMNS = (
     "run", "task", "shift", "variant", "seed", "env_steps", "episode", "metric", "value",
 )  # fmt: skip
-EVAL_CELLS = {"env_steps": int, "metric": str, "value": float}
+EVAL_CELLS = {"env_steps": int, "episode": int, "metric": str, "value": float}
 """Columns that are read back, with what turns their cells into values."""
+WHOLE = ("return", "episode_length")
+"""Measures that every episode has."""
+EVALUATE_AGAIN = "delete it, and the command that trained the run evaluates again"
+SUMS_AGAIN = "delete it: the evaluation counts without it"
 
 
 class RunMismatchError(ValueError):
@@ -152,6 +157,11 @@ class RunDir:
         """The closing episodes, a tidy table; its existence closes the run."""
         return self.path / "eval.csv"
 
+    @property
+    def sums(self) -> Path:
+        """Checksums of the closing episodes by env steps, JSON; written before those."""
+        return self.path / "eval.sums.json"
+
     def status(self, config: TrainConfig, source: dict[str, str] | None = None) -> Status:
         """Judge the directory for a run, once and whole; touches nothing.
 
@@ -161,9 +171,15 @@ class RunDir:
         """
         if not self._is_held and self.owner():
             return Busy(self.busy())
-        work = (self.dataset, self.checkpoints, self.metrics, self.policy, self.episodes)
-        if not self.config.exists() or not any(path.exists() for path in work):
+        work = self._work()
+        if not work:
             return New()
+        if not self.config.exists():
+            names = ", ".join(path.name for path in work)
+            return Foreign(RunMismatchError(
+                f"{self} holds {names} of a run and no {self.config.name}, so whose they are is"
+                " unknown; nothing was touched. Put that file back, or give another --name."
+            ))  # fmt: skip
         if lines := self._differences(config, source):
             shown = "\n  ".join(lines)
             return Foreign(RunMismatchError(
@@ -182,6 +198,15 @@ class RunDir:
             ))  # fmt: skip
         return Resumable()
 
+    def _work(self) -> list[Path]:
+        """Return what there is of a run that cost something; a start that failed leaves nothing."""
+        work = [p for p in (self.dataset, self.policy, self.episodes) if p.exists()]
+        if has_checkpoint(self.path):
+            work.append(self.checkpoints)
+        if self.metrics.exists() and not _is_header_only(self.metrics):
+            work.append(self.metrics)
+        return work
+
     def _differences(self, config: TrainConfig, source: dict[str, str] | None) -> list[str]:
         """Return what differs between the run that is there and one that is meant."""
         old, free = self.read_config(), may_change(config)
@@ -192,15 +217,52 @@ class RunDir:
         return lines
 
     def finished(self) -> Finished | None:
-        """Return how the run was closed, None if it was not."""
+        """Return how the run was closed, None if it was not.
+
+        Raises:
+            FileNotFoundError: There is an evaluation and no config.
+            FileError: The evaluation is damaged or not whole; the message has the remedy.
+        """
         if not self.episodes.is_file():
             return None
+        what = "the evaluation of a run"
+        rows = files.read_rows(self.episodes, what, EVAL_CELLS, remedy=EVALUATE_AGAIN)
+        config = self.read_config()
+        if fault := self._fault_of(rows, config):
+            raise files.FileError(f"{self.episodes}: {fault}; {EVALUATE_AGAIN}")
         values: dict[str, list[float]] = {}
-        env_steps = 0
-        for row in files.read_rows(self.episodes, "the evaluation of a run", EVAL_CELLS):
-            env_steps = row["env_steps"]
+        for row in rows:
             values.setdefault(row["metric"], []).append(row["value"])
-        return Finished(env_steps, episode_means({k: np.array(v) for k, v in values.items()}))
+        means = episode_means({k: np.array(v) for k, v in values.items()})
+        return Finished(rows[0]["env_steps"], means)
+
+    def _fault_of(self, rows: list[dict[str, Any]], config: TrainConfig) -> str | None:
+        """Return what shows that the closing episodes are not those that were written."""
+        steps = {row["env_steps"] for row in rows}
+        if len(steps) != 1:
+            return f"{len(steps)} different env_steps, expected one"
+        most = config.total_env_steps + config.steps_per_epoch * config.num_envs
+        most = max(most, newest_checkpoint(self.path) or 0)
+        if not 0 <= (at := steps.pop()) <= most:
+            return f"env_steps {at:,}, and the run went to {most:,} at most"
+        count = config.eval.final_episodes
+        for name in WHOLE:
+            episodes = sorted(row["episode"] for row in rows if row["metric"] == name)
+            if episodes != list(range(count)):
+                return f"{len(episodes)} rows of {name}, expected one for each of {count} episodes"
+        known = self._sums().get(str(at))  # versions before 0.2 have written none
+        if known not in (None, _sum(self.episodes.read_bytes())):
+            return "its checksum is not that of what was written"
+        return None
+
+    def _sums(self) -> dict[str, str]:
+        """Return env steps -> checksum of the evaluations that have closed this run."""
+        if not self.sums.exists():
+            return {}
+        found = files.read_json(self.sums, "checksums of evaluations", remedy=SUMS_AGAIN)
+        if not isinstance(found, dict):
+            raise files.FileError(f"{self.sums} holds {found!r}, expected checksums; {SUMS_AGAIN}")
+        return found
 
     def open(self, config: TrainConfig, source: dict[str, str] | None = None) -> None:
         """Write down config, source and versions of the part of the run that follows."""
@@ -256,7 +318,9 @@ class RunDir:
             for name, column in values.items()
             for episode in np.flatnonzero(~np.isnan(column))
         ]
-        files.write_csv(self.episodes, [EVAL_COLUMNS, *rows])
+        table = files.csv_text([EVAL_COLUMNS, *rows])
+        files.write_json(self.sums, self._sums() | {str(env_steps): _sum(table.encode())})
+        files.write_text(self.episodes, table)
 
     @contextlib.contextmanager
     def exclusive(self, wait_s: float = 1.0) -> Iterator[None]:
@@ -294,6 +358,19 @@ class RunDir:
             return None
         with self.lock.open() as file:
             return None if _try_lock(file.fileno(), fcntl.LOCK_SH) else file.read() or "a process"
+
+
+def _is_header_only(path: Path) -> bool:
+    """Return whether a table has no row."""
+    if not path.is_file():
+        return False
+    with path.open("rb") as file:
+        file.readline(files.MB)
+        return not file.readline(files.MB)
+
+
+def _sum(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()
 
 
 def _try_lock(descriptor: int, kind: int) -> bool:

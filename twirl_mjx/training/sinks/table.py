@@ -11,6 +11,8 @@ from typing import TextIO
 from twirl_mjx import files
 from twirl_mjx.training.sinks.base import IDENTITY, RunInfo
 
+FINAL = "eval/final_"
+"""How the metrics of the evaluation that closes a run begin."""
 CSV_NAME = "metrics.csv"
 COLUMNS = (*IDENTITY, "metric", "env_steps", "grad_steps", "wall_s", "value")
 """Columns of ``metrics.csv``, one row per metric and epoch."""
@@ -27,8 +29,19 @@ class Table:
         """
         path = run.directory / CSV_NAME
         resumes = run.resume_env_steps is not None and path.exists()
-        self.earlier_s = truncate_csv(path, run.resume_env_steps or 0) if resumes else 0.0
+        self.earlier_s, reached = 0.0, 0
         """``wall_s`` of the last row kept."""
+        begin = run.resume_env_steps or 0
+        if resumes:
+            closes_again = begin >= run.total_env_steps
+            self.earlier_s, reached = truncate_csv(path, begin, closes_again=closes_again)
+        self.lacks = (
+            f"{path} ends at {reached:,} transitions and the run goes on at {begin:,}: the rows"
+            " between are lost (its checkpoints and policies are not affected)"
+            if reached < begin
+            else None
+        )
+        """What a resumed run finds missing, as a line."""
         self._identity = [run.identity[name] for name in IDENTITY]
         self._file: TextIO = path.open("a" if resumes else "w", newline="")
         self._csv = csv.writer(self._file, lineterminator="\n")
@@ -54,15 +67,16 @@ class Table:
         os.fsync(self._file.fileno())
 
 
-def truncate_csv(path: Path, env_steps: int) -> float:
+def truncate_csv(path: Path, env_steps: int, *, closes_again: bool = False) -> tuple[float, int]:
     """Drop the rows after ``env_steps``, and any row a crash left unfinished.
 
     Args:
         path: a ``metrics.csv``; the file is replaced whole.
         env_steps: transitions at the checkpoint the run resumes from.
+        closes_again: whether nothing is left but the final evaluation, whose rows are dropped too.
 
     Returns:
-        ``wall_s`` of the last row kept, 0 without rows.
+        ``wall_s`` and transitions of the last row kept, 0 without rows.
 
     Raises:
         ValueError: the file has other columns, or a damaged row before its last.
@@ -74,5 +88,11 @@ def truncate_csv(path: Path, env_steps: int) -> float:
     if rows and tuple(rows[0]) != COLUMNS:
         raise ValueError(f"{path} has columns {list(rows[0])}, expected {list(COLUMNS)}")
     kept = [row for row in rows if row["env_steps"] <= env_steps]
+    if closes_again:
+        kept = [
+            row
+            for row in kept
+            if row["env_steps"] < env_steps or not row["metric"].startswith(FINAL)
+        ]
     files.write_csv(path, [COLUMNS, *(list(row.values()) for row in kept)])
-    return float(kept[-1]["wall_s"]) if kept else 0.0
+    return (float(kept[-1]["wall_s"]), kept[-1]["env_steps"]) if kept else (0.0, 0)
