@@ -30,6 +30,7 @@ COMMANDS = {
     "bench": "measure learner, worlds and start-up on this machine",
     "rehearse": "run a policy in an independent simulator with latency and noise",
     "demo": "render and evaluate the shipped policies; trains nothing",
+    "runs": "list, show, compare and prune runs",
     "curriculum": "train the chain of tasks one after another",
 }
 """Command name to its one-line description; each lives in ``twirl_mjx.commands.<name>``."""
