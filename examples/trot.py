@@ -1,6 +1,6 @@
 """A task of your own in one file: trot to a goal on four feet.
 
-twirl train --task examples/trot.py:Trot --source trot --trot.speed 0.5
+twirl train --task examples/trot.py:Trot --variant twirl --source trot --trot.speed 0.5
 """
 
 import dataclasses
@@ -39,7 +39,7 @@ class Trot(twirl_mjx.Task[Options]):
     def start(self, key, scene, dynamics):
         pose_key, angle_key = jax.random.split(key)
         qpos, qvel = base.start_on_feet(pose_key, scene, dynamics)
-        angle = jax.random.uniform(angle_key, minval=-jnp.pi, maxval=jnp.pi)
+        angle = jax.random.uniform(angle_key, minval=-1.0, maxval=1.0)
         goal = qpos[:2] + self.options.distance * jnp.stack([jnp.cos(angle), jnp.sin(angle)])
         memory = self.observer.init(qpos, qvel)
         return twirl_mjx.Start(qpos=qpos, qvel=qvel, goal=goal, memory=memory, task=())

@@ -27,7 +27,7 @@ def test_child_updates_in_its_first_epoch_at_the_preset_s_shapes(
     assert words[1:4] == ["-m", "twirl_mjx", "train"]
     options = parse_train(words[4:])
     config, base = options.config, make_config("stand", preset)
-    assert (config.droq, config.env, config.replay) == (base.droq, base.env, base.replay)
+    assert (config.droq, config.num_envs, config.replay) == (base.droq, base.num_envs, base.replay)
     assert options.preset == preset
     assert config.steps_per_epoch == 2
     # The first vector step ends the warm-up, the second is followed by updates.

@@ -94,7 +94,7 @@ def test_latency_delays_a_target_by_physics_steps(
     data = mujoco.MjData(model)
     mujoco.mj_resetDataKeyframe(model, data, model.key("home").id)
     config = dataclasses.replace(IDEAL, latency_ms=70.0)
-    contacts, drive = Contacts(model, "biped"), module.Drive()
+    contacts, drive = Contacts(model, "biped"), module.Drive(np.zeros(12), np.zeros(12))
     targets = deque([(0, HOME)])
     for step in range(3):
         start = step * config.n_substeps + config.latency_steps

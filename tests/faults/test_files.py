@@ -302,7 +302,7 @@ def test_the_package_reads_and_writes_in_one_way() -> None:
 
 def test_only_one_code_finds_the_nearest_name() -> None:
     users = [p.name for p in PACKAGE.rglob("*.py") if "difflib" in p.read_text(encoding="utf-8")]
-    assert sorted(users) == ["checks.py", "dynamics.py"]
+    assert sorted(users) == ["checks.py"]
 
 
 def test_records_stay_readable_by_others(tmp_path: Path) -> None:

@@ -126,7 +126,7 @@ def play(robot: Robot, engine: Any, steps: int, action: np.ndarray) -> np.ndarra
     state, rows = actuation.filter_init(home[7:]), []
     for _ in range(steps):
         target, state = actuation.filter_step(robot, state, wanted)
-        command = actuation.motor_command(robot, motors, target)
+        command = actuation.motor_command(robot, motors, target, dynamics)
         data, _ = step(data, jax.tree.map(lambda leaf: leaf[None], command), worlds)
         rows.append(np.asarray(data.qpos[0]))
     return np.array(rows)
@@ -167,7 +167,7 @@ def test_gaits_find_the_legs_by_where_they_are(made: Robot) -> None:
 def test_captions_and_colours_name_the_legs_of_the_robot(other: Robot) -> None:
     robot, strength = other, np.array([1.0, 0.5, 1.0, 1.0])
     assert look.describe("weakened", robot, make_dynamics(), strength) == "FR leg at 50 %"
-    model = build_scene(robot=robot).mj_model
+    model = build_scene(robot=robot, meshes=True).mj_model
     plain = model.geom_rgba.copy()
     look.paint(model, robot, make_dynamics(), strength)
     red = np.flatnonzero((model.geom_rgba != plain).any(axis=1))
@@ -184,11 +184,11 @@ def test_control_step_is_the_robots(other: Robot) -> None:
 
 
 def test_registry(monkeypatch: pytest.MonkeyPatch, other: Robot) -> None:
-    monkeypatch.setattr(robots, "ROBOTS", dict(robots.ROBOTS))
+    monkeypatch.setattr(robots.ROBOTS, "_items", {"a1": A1})
     assert get_robot("a1") is A1
     assert register_robot(other) is other
     assert get_robot("other") is register_robot(other)
-    with pytest.raises(ValueError, match=r"another robot called 'other'.*none of a1, other"):
-        register_robot(dataclasses.replace(other))
+    with pytest.raises(ValueError, match=r"another robot called 'other'.*nearest: 'my_other'"):
+        register_robot(dataclasses.replace(other, cutoff_hz=5.0))
     with pytest.raises(ValueError, match=r"unknown robot 'othr'.*a1, other \(nearest: 'other'\)"):
         get_robot("othr")

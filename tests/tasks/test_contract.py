@@ -129,7 +129,7 @@ def test_a_config_gives_what_is_not_an_argument() -> None:
         (("stand", "ice"), {}, "unknown shift 'ice'.*nearest: 'icy'"),
         (("stand", "none", 0), {}, r"num_envs = 0 is outside \[1, "),
         (("stand",), {"engine": "mjc"}, "unknown engine 'mjc'.*nearest: 'mjx'"),
-        (("stand",), {"shift_strength": 3.0}, r"shift_strength = 3.0 is outside \[0.0, 2.0\]"),
+        (("stand",), {"shift_strength": 3.0}, r"shift_strength = 3.0 is outside \[0"),
     ],
 )
 def test_bad_arguments_are_refused(

@@ -43,7 +43,9 @@ def numpy_terms(model: mujoco.MjModel, qpos: np.ndarray, height_of: str) -> tupl
     return (0.5 * nose_up(qpos) + 0.5) ** 2, np.exp(height) - 1.0
 
 
-@pytest.mark.parametrize(("options", "height_of"), [({}, "root"), ({"stand": FEET}, "front_feet")])
+@pytest.mark.parametrize(
+    ("options", "height_of"), [({}, "root"), ({"options": FEET}, "front_feet")]
+)
 def test_reward_recomputed_from_the_state(
     options: dict[str, Any],
     height_of: str,

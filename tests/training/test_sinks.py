@@ -163,7 +163,7 @@ def test_a_sink_of_a_file_is_made_and_used(own_file: Path, tmp_path: Path) -> No
         ("{file}:NO_SINK", "NO_SINK is int without open, log, close: expected a class"),
         ("{file}:Half", "Half is Half without log, close"),
         ("{file}:Needy", r"Needy\(\) fails with .* missing 1 required positional argument"),
-        ("{file}:Mime", r"unknown object in my sink.py 'Mime': .*\(nearest: 'Mine'\)"),
+        ("{file}:Mime", r"my sink.py has no object 'Mime' \(nearest: 'Mine'\)"),
     ],
 )
 def test_what_is_no_sink_is_refused_before_anything_starts(
@@ -172,7 +172,7 @@ def test_what_is_no_sink_is_refused_before_anything_starts(
     config = make_config("stand", "debug")
     chosen = (name.format(file=own_file),)
     with pytest.raises(ValueError, match=message) as refusal:
-        pipeline.run(config, "debug", tmp_path / "runs", None, print, chosen)
+        pipeline.run(config, "debug", tmp_path / "runs", None, print, sinks=chosen)
     assert "\n" not in str(refusal.value)
     assert not (tmp_path / "runs").exists()
 

@@ -6,6 +6,7 @@ updates per second for each; end of input ends the process.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import subprocess
@@ -95,8 +96,9 @@ def main(argv: list[str]) -> None:
     """Serve measurements; arguments are the CPU and the options as JSON."""
     if int(argv[0]) >= 0:
         os.sched_setaffinity(0, {int(argv[0])})
-    from twirl_mjx.bench.learner import LearnerBench, make_learner
-    from twirl_mjx.bench.measure import only_json_on_stdout, sample_rates
+    with contextlib.redirect_stdout(sys.stderr):  # mujoco-mjx prints while it is imported
+        from twirl_mjx.bench.learner import LearnerBench, make_learner
+        from twirl_mjx.bench.measure import only_json_on_stdout, sample_rates
 
     with only_json_on_stdout() as out:
         chain, updates = make_learner(LearnerBench(**json.loads(argv[1])), 1)

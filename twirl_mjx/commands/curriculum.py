@@ -57,7 +57,7 @@ def plan(options: CurriculumOptions, preset: str) -> list[tuple[str, TrainConfig
     task = TASKS.admit(options.task)
     for name, settings in chain_of(task):
         source = {"source": str(options.runs / links[-1][0])} if links else {}
-        config = configure(preset, settings | source | {"seed": options.seed}, f"link {name}")
+        config = configure(preset, {**settings, **source, "seed": options.seed}, f"link {name}")
         chained = f"{name}-chain-{preset}-s{options.seed}"
         # The first link is the run of `twirl train`, which may be there already.
         links.append((chained if links else rundir.default_name(config, preset), config))

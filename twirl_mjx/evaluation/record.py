@@ -102,7 +102,9 @@ def scene_model(config: WorldConfig, recording: Recording) -> mujoco.MjModel:
         incline=float(dynamics.incline),
         bump_height=float(dynamics.bump_height),
     )
-    scene = build_scene(get_shift(config.shift).scene, robot=recording.robot, bands=bands)
+    scene = build_scene(
+        get_shift(config.shift).scene, robot=recording.robot, bands=bands, meshes=True
+    )
     model = world_model(scene, dynamics)
     look.paint(model, recording.robot, dynamics, recording.leg_strength)
     return model

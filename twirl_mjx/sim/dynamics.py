@@ -289,7 +289,7 @@ def make_dynamics(
         ValueError: Unknown shift or leaf, strength outside [0, 2], a value out of its range or
             without effect in the shift's scene.
     """
-    check_range("shift strength", strength, 0, 2)
+    check_range("shift_strength", strength, 0, 2)
     chosen, values = get_shift(shift), dict(NOMINAL_VALUES)
     for name, shifted in chosen.values:
         leaf = LEAF[name]

@@ -146,6 +146,7 @@ def describe(shift: str, robot: Robot, dynamics: Dynamics, leg_strength: np.ndar
     others = [
         f"{leaf.name} {float(leaf_value(dynamics, leaf.name)):.3g}{leaf.unit.replace('1', '')}"
         for leaf in LEAVES
-        if leaf.name not in told and float(leaf_value(dynamics, leaf.name)) != leaf.nominal
+        if leaf.name not in told
+        and float(leaf_value(dynamics, leaf.name)) != np.float32(leaf.nominal)
     ]
     return ", ".join(filter(None, [shown, *others]))

@@ -43,12 +43,14 @@ def source_model(robot: Robot) -> mujoco.MjModel:
     return raw
 
 
-def robot_spec(robot: Robot, colliding: Sequence[str]) -> mujoco.MjSpec:
+def robot_spec(robot: Robot, colliding: Sequence[str], meshes: bool = False) -> mujoco.MjSpec:
     """Return a specification with the robot and nothing else, ready for a scene.
 
     Args:
         robot: The record.
         colliding: Body classes whose shapes can meet the ground.
+        meshes: Keep the meshes of the file. They are seen, but nothing meets them, and every
+            world of a batch would hold its own copy.
 
     Raises:
         FileNotFoundError: There is no such file.
@@ -58,6 +60,8 @@ def robot_spec(robot: Robot, colliding: Sequence[str]) -> mujoco.MjSpec:
     spec, raw = load(robot.name, robot.model)
     _keep_masses(spec, raw)
     _strip(spec, robot)
+    if not meshes:
+        _delete_meshes(spec)
     for shape in robot.contact_geoms:
         _add_shape(spec.body(robot.body_of(shape)), shape, shape.body in colliding)
     if not spec.body(robot.trunk).joints:
@@ -117,6 +121,13 @@ def _strip(spec: mujoco.MjSpec, robot: Robot) -> None:
         for element in getattr(spec, kind):
             if element.name in names:
                 element.name = f"robot_{element.name}"
+
+
+def _delete_meshes(spec: mujoco.MjSpec) -> None:
+    for geom in [g for g in spec.geoms if g.type == mujoco.mjtGeom.mjGEOM_MESH]:
+        spec.delete(geom)
+    for mesh in list(spec.meshes):
+        spec.delete(mesh)
 
 
 def _add_shape(body: mujoco.MjsBody, shape: ContactGeom, meets_ground: bool) -> None:

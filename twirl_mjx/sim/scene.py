@@ -50,8 +50,6 @@ DRAWN_HALF_WIDTH = 1.5
 BUMPY_PIECES = (2, 20)
 """Pieces in x and y of which a band on a heightfield is drawn, each lying on its own ground."""
 
-MESH_ARRAYS = ("mesh_vert", "mesh_normal", "mesh_face")
-"""Arrays of some 100 000 rows in a robot's file, which would make tracing take minutes."""
 
 HeightOf = Callable[[np.ndarray], np.ndarray]
 """Ground height [K] in m under world positions [K, 2]."""
@@ -119,12 +117,10 @@ class Scene:
 
     @functools.cached_property
     def mjx_model(self) -> mjx.Model:
-        """The model on the device, without the meshes: they are seen, but nothing meets them."""
+        """The model on the device."""
         # First asked for inside a trace, it must hold arrays all the same: it is kept.
         with jax.ensure_compile_time_eval():
-            model = mjx.put_model(self.mj_model)
-        unseen = {name: getattr(model, name)[:0] for name in MESH_ARRAYS} if model.nmesh else {}
-        return model.replace(**unseen)
+            return mjx.put_model(self.mj_model)
 
 
 def unit_bumps() -> np.ndarray:
@@ -224,6 +220,7 @@ def build_scene(
     options: SimOptions | None = None,
     goal_marker: bool = False,
     bands: Bands | None = None,
+    meshes: bool = False,
 ) -> Scene:
     """Build and compile a scene with ``mujoco.MjSpec``.
 
@@ -234,6 +231,7 @@ def build_scene(
         options: Physics settings; the control step is the robot's.
         goal_marker: Add a mocap body ``goal`` with a visible, untouchable pole.
         bands: Hurdle bands to draw.
+        meshes: Keep the robot's meshes, for pictures.
 
     Returns:
         The compiled scene.
@@ -245,7 +243,7 @@ def build_scene(
     """
     options = dataclasses.replace(options or SimOptions(), control_dt=robot.control_dt)
     bumps = unit_bumps() if kind == "bumpy" else np.zeros((1, 1), np.float32)
-    spec = robot_spec(robot, COLLIDING[collision])
+    spec = robot_spec(robot, COLLIDING[collision], meshes)
     look.add_look(spec, kind, bumps)
     ground = _add_ground(spec, kind)
     if goal_marker:

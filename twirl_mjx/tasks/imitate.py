@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
+from typing import cast
 
 import flax.struct
 import jax
@@ -29,7 +30,7 @@ from twirl_mjx.sim import frames, kinematics
 from twirl_mjx.sim.dynamics import Dynamics
 from twirl_mjx.sim.robot import CONTROL_DT, HIP, ROOT_SIZE, THIGH, TRUNK, Robot
 from twirl_mjx.sim.robots import A1
-from twirl_mjx.sim.scene import CollisionSet, Scene
+from twirl_mjx.sim.scene import Scene
 from twirl_mjx.tasks import base, rewards
 from twirl_mjx.tasks.observations import HISTORY, Entry, in_history
 from twirl_mjx.tasks.registry import register
@@ -273,7 +274,7 @@ class Imitate(Task[ImitateOptions]):
 
     name = "imitate"
     Options = ImitateOptions
-    collision: CollisionSet = "feet"
+    collision = "feet"
     measures = {
         "tracking": Measure("tracking", "mean", 1.0, "1", "mean reward over its maximum"),
         "leaps": Measure("leaps", "max", 1.0, "1", "cycles of the clip survived"),
@@ -288,7 +289,6 @@ class Imitate(Task[ImitateOptions]):
     course_options = ("standing_fraction",)
     training_options = ("standing_fraction",)
     caption = ("tracking",)
-    observer: ImitateObserver
 
     def make_observer(self) -> ImitateObserver:
         """Load the clip.
@@ -299,15 +299,20 @@ class Imitate(Task[ImitateOptions]):
         """
         return ImitateObserver(load_clip(self.options.clip, self.robot))
 
+    @property
+    def follower(self) -> ImitateObserver:
+        """The observer, by its own kind."""
+        return cast(ImitateObserver, self.observer)
+
     def start(self, key: jax.Array, scene: Scene, dynamics: Dynamics) -> base.Start:
         """Start on the reference, or at rest in a share ``standing_fraction`` of the episodes.
 
         phase = U(0, cycle); standing_time from rest.
         """
         place_key, phase_key, pose_key, standing_key = jax.random.split(key, 4)
-        phase = jax.random.uniform(phase_key, maxval=self.observer.duration)
+        phase = jax.random.uniform(phase_key, maxval=self.follower.duration)
         xy = base.start_xy(place_key, scene)
-        qpos, qvel = sample(self.observer.clip, phase)
+        qpos, qvel = sample(self.follower.clip, phase)
         qpos = qpos.at[:2].set(xy).at[2].add(base.ground_at(scene, dynamics, xy))
         endpoints = kinematics.forward(scene.robot, qpos).endpoints
         lowest = jnp.min(base.clearances(scene, dynamics, endpoints))
@@ -316,12 +321,12 @@ class Imitate(Task[ImitateOptions]):
             rest, still = base.start_on_feet(pose_key, scene, dynamics)
             take = jax.random.uniform(standing_key) < self.options.standing_fraction
             qpos, qvel = jnp.where(take, rest, qpos), jnp.where(take, still, qvel)
-            phase = jnp.where(take, jnp.float32(self.observer.standing_time), phase)
+            phase = jnp.where(take, jnp.float32(self.follower.standing_time), phase)
         return base.Start(
             qpos=qpos,
             qvel=qvel,
             goal=qpos[:2],
-            memory=self.observer.init_at(phase, qpos, qvel),
+            memory=self.follower.init_at(phase, qpos, qvel),
             task=ImitateState(
                 airborne_steps=jnp.zeros((), jnp.int32),
                 flew=jnp.zeros((), bool),
@@ -332,7 +337,7 @@ class Imitate(Task[ImitateOptions]):
     def judge(self, world: base.World, view: base.View, scene: Scene) -> base.Outcome:
         """Score one control step against the reference at its end."""
         options, qpos, qvel = self.options, view.qpos, view.qvel
-        ref_qpos, ref_qvel = self.observer.reference(world.memory)
+        ref_qpos, ref_qvel = self.follower.reference(world.memory)
         root_error = jnp.append(qpos[:2], view.height) - ref_qpos[:3]
         turn = frames.multiply(frames.conjugate(ref_qpos[3:7]), qpos[3:7])
         angle = frames.rotation_angle(turn)
@@ -351,8 +356,8 @@ class Imitate(Task[ImitateOptions]):
         fall = base.touches(view, TRUNK, HIP, THIGH) | base.knees_touch(view)
         lost = (distance > options.max_root_error) | (angle > options.max_root_angle)
         airborne = jnp.all(base.foot_clearance(view) > base.LIFTED)
-        leaps = self.observer.cycles(world.memory.elapsed)
-        completed = leaps > self.observer.cycles(world.memory.elapsed - self.robot.control_dt)
+        leaps = self.follower.cycles(world.memory.elapsed)
+        completed = leaps > self.follower.cycles(world.memory.elapsed - self.robot.control_dt)
         task = count_flights(world.task, airborne, completed)
         return base.Outcome(
             reward=reward,

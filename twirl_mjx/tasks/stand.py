@@ -20,7 +20,7 @@ from twirl_mjx.checks import check_choice, check_range
 from twirl_mjx.sim import frames
 from twirl_mjx.sim.dynamics import Dynamics
 from twirl_mjx.sim.robot import CALF, HIP, THIGH, TRUNK
-from twirl_mjx.sim.scene import CollisionSet, Scene
+from twirl_mjx.sim.scene import Scene
 from twirl_mjx.tasks import base, rewards
 from twirl_mjx.tasks.goals import GOAL_OPTIONS, GoalOptions, draw_goal
 from twirl_mjx.tasks.observations import Observer, ProprioceptiveObserver
@@ -72,7 +72,7 @@ class Stand(Task[StandOptions]):
 
     name = "stand"
     Options = StandOptions
-    collision: CollisionSet = "feet"
+    collision = "feet"
     measures = STANDING_MEASURES
     lead = ("return", "standing_time", "on_feet")
     presets = {

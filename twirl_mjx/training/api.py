@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import dataclasses
 import functools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,7 @@ from twirl_mjx.training.config import TrainConfig
 from twirl_mjx.training.config_json import settle
 from twirl_mjx.training.presets import default_preset, make_config
 from twirl_mjx.training.rundir import RunDir
+from twirl_mjx.training.sinks.base import Sink
 from twirl_mjx.types import Policy, SourcePolicy
 
 
@@ -59,6 +60,7 @@ def train(
     source: str | SourcePolicy | None = None,
     name: str | None = None,
     runs: Path | str = "runs",
+    sinks: Sequence[str | Sink] = (),
     say: Callable[[str], None] = print,
     **settings: Any,
 ) -> RunResult:
@@ -70,6 +72,8 @@ def train(
         source: A policy object (``types.SourcePolicy``), or what ``--source`` takes.
         name: Name of the run; derived from task, variant, preset and seed by default.
         runs: Folder of all runs.
+        sinks: Where metrics go beside ``metrics.csv``, TensorBoard and the terminal: names
+            (``wandb``), ``file.py:Name``, or objects (``training.sinks.base.Sink``).
         say: Prints one line for a person.
         **settings: Settings of the run by name (``seed=1``, ``shift="icy"``,
             ``total_env_steps=50_000``); those of a part as a mapping (``droq={"utd": 1.0}``,
@@ -95,7 +99,7 @@ def train(
         kind = type(source)
         given = Source(source, f"object {kind.__qualname__}", f"{kind.__module__}.{kind.__name__}")
     config = settle(make_config(registered, preset), flat)
-    run_dir = pipeline.run(config, preset, Path(runs), name, say, given)
+    run_dir = pipeline.run(config, preset, Path(runs), name, say, given, sinks)
     done = run_dir.finished()
     assert done is not None, "pipeline.run returns finished runs"
     return RunResult(run_dir.path, config, done.measures)

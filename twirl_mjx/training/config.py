@@ -153,8 +153,8 @@ class TrainConfig(WorldConfig):
     def evaluation(self) -> WorldConfig:
         """The worlds it evaluates in: as trained in, without what is for training only."""
         return WorldConfig(
-            **world_fields(self)
-            | {
+            **{
+                **world_fields(self),
                 "options": self.task_type.evaluation_options(self.options),
                 "num_envs": self.eval.episodes,
                 "episode_length": self.eval.episode_length,

@@ -221,7 +221,7 @@ class RunDir:
         Raises:
             FileNotFoundError: This is no run directory; the message lists the runs beside it.
         """
-        if not self.config.is_file():
+        if not self.config.exists():
             parent = self.path.parent
             runs = sorted(p.parent.name for p in parent.glob(f"*/{self.config.name}"))
             raise FileNotFoundError(

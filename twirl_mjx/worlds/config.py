@@ -18,8 +18,8 @@ from twirl_mjx.tasks.task import Task
 REGISTRIES = (TASKS, SHIFTS, ROBOTS)
 """What a config may name that can come from a user's own file."""
 
-DynamicsOverrides: Any = dataclasses.make_dataclass(
-    "DynamicsOverrides",
+_ByLeaf: Any = dataclasses.make_dataclass(
+    "_ByLeaf",
     [
         (
             leaf.name,
@@ -32,9 +32,13 @@ DynamicsOverrides: Any = dataclasses.make_dataclass(
         for leaf in LEAVES
     ],
     frozen=True,
-    namespace={"__doc__": "Physical parameters set by hand, after the shift."},
 )
-"""One optional value per leaf of ``Dynamics``."""
+
+
+class DynamicsOverrides(_ByLeaf):
+    """Physical parameters set by hand, after the shift: one optional value per leaf."""
+
+
 NO_OVERRIDES = DynamicsOverrides()
 
 

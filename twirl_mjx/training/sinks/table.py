@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import csv
-import io
 import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TextIO
 
+from twirl_mjx import files
 from twirl_mjx.training.sinks.base import IDENTITY, RunInfo
 
 CSV_NAME = "metrics.csv"
@@ -65,17 +65,14 @@ def truncate_csv(path: Path, env_steps: int) -> float:
         ``wall_s`` of the last row kept, 0 without rows.
 
     Raises:
-        ValueError: the file has other columns.
+        ValueError: the file has other columns, or a damaged row before its last.
     """
-    with path.open(newline="") as file:
-        text = file.read()
-    whole = text[: text.rfind("\n") + 1]  # a row without its line end was being written
-    rows = list(csv.reader(io.StringIO(whole, newline="")))
+    what = f"a metrics table with columns {','.join(COLUMNS)}"
+    rows = files.read_rows(
+        path, what, {"env_steps": int, "wall_s": files.number_text}, growing=True
+    )
     if rows and tuple(rows[0]) != COLUMNS:
-        raise ValueError(f"{path} has columns {rows[0]}, expected {list(COLUMNS)}")
-    kept = [row for row in rows[1:] if len(row) == len(COLUMNS) and int(row[6]) <= env_steps]
-    partial = path.with_name(path.name + ".partial")
-    with partial.open("w", newline="") as file:
-        csv.writer(file, lineterminator="\n").writerows([COLUMNS, *kept])
-    partial.replace(path)
-    return float(kept[-1][8]) if kept else 0.0
+        raise ValueError(f"{path} has columns {list(rows[0])}, expected {list(COLUMNS)}")
+    kept = [row for row in rows if row["env_steps"] <= env_steps]
+    files.write_csv(path, [COLUMNS, *(list(row.values()) for row in kept)])
+    return float(kept[-1]["wall_s"]) if kept else 0.0
