@@ -13,8 +13,8 @@ import pytest
 
 from twirl_mjx import cli
 from twirl_mjx.commands import collect, demo, options, render
-from twirl_mjx.deploy.gl import RenderError
 from twirl_mjx.replay import dataset
+from twirl_mjx.sim.gl import RenderError
 from twirl_mjx.training import pipeline
 
 

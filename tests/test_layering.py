@@ -15,12 +15,15 @@ ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = "twirl_mjx"
 
 BASE = {
-    "types", "checks", "exits", "files", "array_files", "plugins", "records", "assets",
+    "cache", "machine", "types", "checks", "exits", "files", "array_files", "plugins", "records",
+    "assets",
 }  # fmt: skip
 WORLD = BASE | {"sim", "motion", "tasks", "worlds"}
 ACTING = WORLD | {"droq", "policies"}
 ALLOWED: dict[str, set[str]] = {
     "types": set(),
+    "cache": set(),
+    "machine": set(),
     "checks": set(),
     "exits": set(),
     "assets": set(),
@@ -163,12 +166,14 @@ def test_layers_have_no_cycle() -> None:
 
 
 def test_only_the_command_line_touches_the_environment() -> None:
-    """``bench`` starts child processes and may read what they shall inherit."""
+    """``bench`` starts child processes and may read what they shall inherit; ``cache`` asks
+    where compiled programs are kept.
+    """
     faults = []
     for path in sources(PACKAGE):
         source = path.read_text(encoding="utf-8")
         part = part_of(module_name(path))
-        rule = environment_writes if part == "bench" else environment_uses
+        rule = environment_writes if part in {"bench", "cache"} else environment_uses
         if part != "cli":
             faults += [f"{path.relative_to(ROOT)}:{line}" for line in rule(source)]
     assert not faults

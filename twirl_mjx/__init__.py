@@ -18,8 +18,10 @@ if TYPE_CHECKING:
     from twirl_mjx.tasks.task import Task as Task
     from twirl_mjx.training.api import RunResult as RunResult
     from twirl_mjx.training.api import train as train
+    from twirl_mjx.worlds.adapters import register_gymnasium as register_gymnasium
     from twirl_mjx.worlds.adapters import to_brax as to_brax
     from twirl_mjx.worlds.adapters import to_gymnasium as to_gymnasium
+    from twirl_mjx.worlds.adapters import to_gymnasium_vector as to_gymnasium_vector
     from twirl_mjx.worlds.config import WorldConfig as WorldConfig
     from twirl_mjx.worlds.make import make as make
 
@@ -36,8 +38,10 @@ _HOMES = {
     "WorldConfig": "twirl_mjx.worlds.config",
     "load_policy": "twirl_mjx.policies.learned",
     "make": "twirl_mjx.worlds.make",
+    "register_gymnasium": "twirl_mjx.worlds.adapters",
     "to_brax": "twirl_mjx.worlds.adapters",
     "to_gymnasium": "twirl_mjx.worlds.adapters",
+    "to_gymnasium_vector": "twirl_mjx.worlds.adapters",
     "train": "twirl_mjx.training.api",
 }
 __all__ = sorted(_HOMES)  # pyright: ignore[reportUnsupportedDunderAll]

@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-import contextlib
 import importlib
-import io
 import logging
 import os
 import sys
 import threading
 import traceback
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
-from twirl_mjx import exits, faults
+from twirl_mjx import exits, faults, machine
+from twirl_mjx.cache import LEAST_COMPILE_S, cache_folder
 from twirl_mjx.checks import nearest
-from twirl_mjx.deploy.gl import probe_gl
+from twirl_mjx.commands.waiting import waiting
+from twirl_mjx.sim.gl import probe_gl
 
 COMMANDS = {
     "train": "train a task: source policy, its experience, TWiRL; resumes",
@@ -31,6 +30,7 @@ COMMANDS = {
     "bench": "measure learner, worlds and start-up on this machine",
     "rehearse": "run a policy in an independent simulator with latency and noise",
     "demo": "render and evaluate the shipped policies; trains nothing",
+    "runs": "list, show, compare and prune runs",
     "curriculum": "train the chain of tasks one after another",
 }
 """Command name to its one-line description; each lives in ``twirl_mjx.commands.<name>``."""
@@ -50,19 +50,17 @@ def _usage() -> str:
 def _set_environment() -> None:
     """Choose the compilation cache before anything heavy is imported.
 
-    ``TWIRL_CACHE_DIR`` places jax's persistent compilation cache (``~/.cache/twirl_mjx/jax`` by
-    default); ``TWIRL_CACHE_DIR=off`` switches it off. Settings of jax itself win.
+    By an environment variable, which child processes inherit. Settings of jax itself win.
     """
-    cache = os.environ.get("TWIRL_CACHE_DIR", str(Path.home() / ".cache" / "twirl_mjx" / "jax"))
-    if cache != "off":
-        os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", cache)
-        os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.5")
+    if (folder := cache_folder(os.environ)) is not None:
+        os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(folder))
+        os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", str(LEAST_COMPILE_S))
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # Ray would report to its makers
 
 
 def set_up(draws: bool) -> None:
-    """Choose the GL backend, which MuJoCo reads when it is imported, then import MuJoCo.
+    """Choose the GL backend, which MuJoCo reads when it is imported.
 
     Args:
         draws: Whether anything will be drawn; if not, no backend is looked for.
@@ -71,18 +69,13 @@ def set_up(draws: bool) -> None:
         RenderError: Something will be drawn and no backend works.
     """
     if "MUJOCO_GL" not in os.environ:
-        os.environ["MUJOCO_GL"] = probe_gl(os.environ) if draws else "disable"
-    _import_quietly("mujoco.mjx")
+        with waiting("looking for a way to draw without a display"):
+            os.environ["MUJOCO_GL"] = probe_gl(os.environ) if draws else "disable"
 
 
 def _import_command(name: str) -> Any:
-    return _import_quietly(f"twirl_mjx.commands.{name}")
-
-
-def _import_quietly(module: str) -> Any:
-    """Import a module; what libraries print while they are imported is kept off stdout."""
-    with contextlib.redirect_stdout(io.StringIO()):
-        return importlib.import_module(module)
+    with waiting("loading jax and MuJoCo"):
+        return importlib.import_module(f"twirl_mjx.commands.{name}")
 
 
 def _show_one_line_each(name: str) -> Callable[[], None]:
@@ -129,6 +122,9 @@ def main(argv: list[str] | None = None) -> int:
     Returns:
         Exit status: 0 done, else one of ``exits``.
     """
+    if not machine.is_supported():
+        print(f"twirl: {machine.UNSUPPORTED}", file=sys.stderr)
+        return exits.UNUSABLE
     owns_process = argv is None
     argv = list(sys.argv[1:] if argv is None else argv)
     if not argv or argv[0] in ("-h", "--help"):

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import os
 import subprocess
+import sys
 from pathlib import Path
 
 import imageio_ffmpeg
@@ -10,18 +11,14 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from twirl_mjx.deploy import gl as gl_probe
 from twirl_mjx.deploy import render
 from twirl_mjx.deploy.rehearsal import IDEAL
-from twirl_mjx.deploy.render import (
-    CameraView,
-    RenderError,
-    SceneRenderer,
-    look_at_path,
-    render_frames,
-)
+from twirl_mjx.deploy.render import look_at_path, render_frames
 from twirl_mjx.deploy.robot import build_model
 from twirl_mjx.deploy.video import overlay_text, strip_indices, write_strip, write_video
+from twirl_mjx.sim import gl as gl_probe
+from twirl_mjx.sim.draw import CameraView, SceneRenderer
+from twirl_mjx.sim.gl import RenderError
 from twirl_mjx.sim.scene import BUMP_CELL, BUMP_HALF_SIZE, build_scene
 
 SIZE = (96, 64)
@@ -35,7 +32,7 @@ def model() -> mujoco.MjModel:
 @pytest.fixture(scope="module")
 def gl(model: mujoco.MjModel) -> None:
     try:
-        render.open_context(16, 16).free()
+        gl_probe.open_context(16, 16).free()
     except RenderError as error:
         pytest.skip(f"no headless OpenGL on this machine: {error}")
 
@@ -114,10 +111,13 @@ def test_bad_trajectories_are_refused(model: mujoco.MjModel) -> None:
 
 
 def test_message_names_what_was_tried_and_the_fix(monkeypatch: pytest.MonkeyPatch) -> None:
-    for module in (render, gl_probe):
-        monkeypatch.setattr(module, "GL_BACKENDS", ("nosuch", "neither"))
+    monkeypatch.setattr(gl_probe, "GL_BACKENDS", ("nosuch", "neither"))
+    monkeypatch.setitem(sys.modules, "OpenGL", render)  # the process has its platform
     with pytest.raises(RenderError, match=r"Tried nosuch: .*; neither: .*Fix: .*libegl1"):
-        render.open_context(8, 8)
+        gl_probe.open_context(8, 8)
+    monkeypatch.delitem(sys.modules, "OpenGL")
+    with pytest.raises(RenderError, match=r"Tried nosuch: RuntimeError: .*; neither: .*libegl1"):
+        gl_probe.open_context(8, 8)
     with pytest.raises(RenderError, match=r"nosuch: RuntimeError: invalid value .*neither: "):
         gl_probe.probe_gl(os.environ)
 

@@ -139,3 +139,22 @@ def test_a_policy_file_of_an_unknown_task_is_named(tmp_path: Path) -> None:
     path = save(tmp_path / "mine.npz", task="crawl")
     with pytest.raises(PolicyFileError, match=r"mine\.npz: unknown task 'crawl'"):
         config_of(path, None)
+
+
+def test_tables_fit_into_80_columns(capsys: pytest.CaptureFixture[str]) -> None:
+    names = ("clearances_mean", "min_distance", "episode_length", "standing_time")
+    shifts = ("none", "bumpy", "icy", "weakened", "sloped", "gravity", "a_shift_of_my_own")
+    values = {
+        shift: {"return": np.arange(100.0)} | {name: np.full(100, 1234.5) for name in names}
+        for shift in shifts
+    }
+    evaluate._print_table("runs/biped-twirl-cpu-s0 in biped", values)
+    lines = capsys.readouterr().out.splitlines()
+    assert max(map(len, lines)) <= 80
+    assert not any("\u2026" in line for line in lines)  # nothing is cut
+    heads = [word for line in lines for word in line.split() if word in shifts]
+    assert heads == list(shifts)
+    returns = [line.split()[1:] for line in lines if line.split()[:1] == ["return"]]
+    means = [cell for row in returns if row[0] != "IQM" for cell in row]
+    assert means == ["49.5"] * len(shifts)
+    assert any("min_distance (median)" in line for line in lines)

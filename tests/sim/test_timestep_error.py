@@ -8,8 +8,8 @@ import mujoco
 import numpy as np
 import pytest
 import scipy.signal
-from mujoco import mjx
 
+from twirl_mjx.sim import mjx
 from twirl_mjx.sim.robots import A1
 
 CONTROL_DT = 0.05

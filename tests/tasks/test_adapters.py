@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import pickle
 import warnings
 from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
 
+import gymnasium
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,9 +16,19 @@ import pytest
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import check_env
+from gymnasium.vector import AutoresetMode
 
-from twirl_mjx.worlds.adapters import GymnasiumEnv, to_brax, to_gymnasium
+import twirl_mjx
+from twirl_mjx.sim.gl import RenderError, open_context
+from twirl_mjx.worlds.adapters import (
+    GymnasiumEnv,
+    GymnasiumVectorEnv,
+    to_brax,
+    to_gymnasium,
+    to_gymnasium_vector,
+)
 from twirl_mjx.worlds.config import WorldConfig
+from twirl_mjx.worlds.vector import VectorEnv
 
 LIMIT = 4
 CONFIG = WorldConfig(episode_length=LIMIT)
@@ -80,23 +92,113 @@ def test_gymnasium_refuses(gym: GymnasiumEnv) -> None:
     assert gym.render() is None
 
 
-def test_rendered_frame_shows_the_robot(gym: GymnasiumEnv, monkeypatch: pytest.MonkeyPatch) -> None:
-    try:  # what MUJOCO_GL=egl does, which is read when mujoco is imported
-        from mujoco.egl import GLContext
-    except Exception as error:  # drivers and PyOpenGL fail in many types
+@pytest.fixture(scope="module")
+def _gl() -> None:
+    try:
+        open_context(16, 16).free()
+    except RenderError as error:
         pytest.skip(f"no headless OpenGL on this machine: {error}")
-    monkeypatch.setattr("mujoco.rendering.classic.gl_context.GLContext", GLContext)
+
+
+@pytest.mark.usefixtures("_gl")
+def test_rendered_frame_shows_the_robot(gym: GymnasiumEnv) -> None:
+    """Without any environment variable: a backend is found as on the command line."""
     env = GymnasiumEnv(gym.env, render_mode="rgb_array")
-    env._qpos = gym.env.mj_model.key("home").qpos.copy()
+    with pytest.raises(ResetNeeded, match="nothing to draw"):
+        env.render()
+    env.reset(seed=0)
     near = env.render()
-    env._qpos[2] += 3.0
-    far = env.render()
-    env.close()
     assert near is not None
     assert near.shape == (480, 640, 3)
     assert near.dtype == np.uint8
-    assert far is not None
+    state: Any = env._shown
+    qpos = state.data.qpos.at[0, 2].add(30.0)
+    far = gym.env.render(state.replace(data=state.data.replace(qpos=qpos)))
+    env.close()
     assert np.abs(near.astype(float) - far).mean() > 1.0
+
+
+@pytest.fixture(scope="module")
+def batch() -> GymnasiumVectorEnv:
+    return to_gymnasium_vector("stand", num_envs=3, engine="native", config=CONFIG)
+
+
+def test_vector_env_resets_in_the_same_step(batch: GymnasiumVectorEnv) -> None:
+    """Two worlds fall into their time limit together; a third one a step later."""
+    obs, info = batch.reset(seed=3)
+    assert batch.metadata["autoreset_mode"] == AutoresetMode.SAME_STEP
+    assert batch.observation_space.contains(obs)
+    assert batch.action_space.shape == (3, 12)
+    assert info["_upright"].all()
+    state: Any = batch._state
+    late = state.world.episode_step.at[1].set(1)
+    batch._state = state.replace(world=state.world.replace(episode_step=late))
+    for step in range(1, LIMIT + 1):
+        obs, reward, terminated, truncated, info = batch.step(np.full((3, 12), 0.1))
+        ends = [step == LIMIT, step == LIMIT - 1, step == LIMIT]
+        np.testing.assert_array_equal(truncated, ends)
+        assert not terminated.any()
+        assert (reward > 0.3).all()
+        assert ("final_obs" in info) == any(ends)
+        if any(ends):
+            np.testing.assert_array_equal(info["_final_obs"], ends)
+            actions = info["final_obs"][:, 83:95]  # of the old episode; no world acted in the new
+            np.testing.assert_allclose(actions[ends], 0.1, rtol=1e-6)
+            np.testing.assert_array_equal(obs[ends][:, 83:95], 0.0)
+            np.testing.assert_array_equal(info["final_info"]["upright"], info["upright"])
+
+
+def test_vector_env_agrees_with_the_single_one(
+    batch: GymnasiumVectorEnv, gym: GymnasiumEnv
+) -> None:
+    """World 0 of three draws what one world draws, whose numbers do not depend on N."""
+    many, one = batch.reset(seed=8)[0], gym.reset(seed=8)[0]
+    np.testing.assert_allclose(many[0], one, atol=1e-6)
+    action = np.full(12, 0.2, np.float32)
+    many, reward, *_ = batch.step(np.tile(action, (3, 1)))
+    one, single, *_ = gym.step(action)
+    np.testing.assert_allclose(many[0], one, atol=1e-5)
+    assert reward[0] == pytest.approx(single, rel=1e-5)
+
+
+def test_vector_env_refuses(batch: GymnasiumVectorEnv) -> None:
+    batch.reset(seed=0)
+    with pytest.raises(ValueError, match=r"action has shape \(3, 11\), need \(3, 12\)"):
+        batch.step(np.zeros((3, 11)))
+    with pytest.raises(ResetNeeded):
+        GymnasiumVectorEnv(batch.env).step(np.zeros((3, 12)))
+    with pytest.raises(ValueError, match="unknown render_mode 'human'"):
+        GymnasiumVectorEnv(batch.env, render_mode="human")
+    assert batch.render() is None
+
+
+def test_ids_of_gymnasium() -> None:
+    ids = twirl_mjx.register_gymnasium()
+    assert ids == twirl_mjx.register_gymnasium()  # twice is once
+    assert {"twirl_mjx/Stand-v0", "twirl_mjx/Hurdles-v0"} <= set(ids)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        one = gymnasium.make("twirl_mjx/Stand-v0", config=CONFIG)
+        many = gymnasium.make_vec("twirl_mjx/Stand-v0", num_envs=2, shift="icy", engine="native")
+    assert isinstance(one.unwrapped, GymnasiumEnv)
+    assert isinstance(many.unwrapped, GymnasiumVectorEnv)
+    assert many.num_envs == 2
+    assert float(many.unwrapped.env.dynamics.friction[0]) < 0.5
+
+
+def test_environments_are_pickled_as_what_they_were_made_of(batch: GymnasiumVectorEnv) -> None:
+    again = pickle.loads(pickle.dumps(batch))
+    assert (again.num_envs, again.env.episode_length) == (3, LIMIT)
+    assert repr(again.env) == repr(batch.env)
+    with pytest.raises(ResetNeeded):
+        again.step(np.zeros((3, 12)))
+    env = batch.env
+    by_hand = VectorEnv(
+        env.task, env.scene, env.engine, num_envs=3, episode_length=4,
+        dynamics=env.dynamics, metric_names=env.metric_names,
+    )  # fmt: skip
+    with pytest.raises(pickle.PicklingError, match=r"only worlds of twirl_mjx\.make"):
+        pickle.dumps(by_hand)
 
 
 @pytest.fixture(scope="module")

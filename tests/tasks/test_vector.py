@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable
 from typing import Any
 
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 
 from twirl_mjx.sim.dynamics import make_dynamics, stack
+from twirl_mjx.sim.gl import RenderError, open_context
 from twirl_mjx.worlds.vector import EnvState, make_transition
 
 Place = Callable[[EnvState, int, np.ndarray], EnvState]
@@ -268,3 +270,52 @@ def test_transition_is_what_a_learner_needs(made: Any, midway: EnvState) -> None
     np.testing.assert_array_equal(transition.action, jnp.ones((3, 12)))
     np.testing.assert_array_equal(transition.terminated, [False] * 3)  # a limit is no end
     np.testing.assert_array_equal(transition.reward, result.reward)
+
+
+def test_eager_calls_are_compiled_once_and_traced_ones_are_not_nested(
+    made: Any, midway: EnvState, count_traces: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    env = copy.copy(made.env)
+    counter = count_traces(env._step)
+    monkeypatch.setattr(env, "_step", counter)
+    first = env.step(midway, np.zeros((3, 12)))
+    env.step(first, jnp.ones((3, 12)))
+    assert counter.traces == 1
+    wanted = made.step(midway, zeros())
+    assert_same_worlds(first, wanted, [0, 1, 2])
+    text = str(jax.make_jaxpr(lambda s: env.step(s, zeros()).reward)(midway))
+    assert counter.traces == 2
+    assert "name=_step" not in text  # the caller's program holds the step itself
+    assert_same_worlds(env.reset(jax.random.key(1)), made.reset(1), [0, 1, 2])
+
+
+def test_worlds_say_what_they_are(made: Any) -> None:
+    assert repr(made.env) == (
+        "<VectorEnv stand: 3 worlds on flat ground, robot a1, engine native; observation [101],"
+        " action [12] in [-1, 1], 20 Hz, episodes of 400 steps>"
+    )
+    assert made.env.observation_space.shape == (101,)
+    assert made.env.action_space.contains(np.ones(12, np.float32))
+    assert not made.env.action_space.contains(np.full(12, 1.1, np.float32))
+
+
+def test_render_refuses_a_world_that_is_not_there(made: Any, midway: EnvState) -> None:
+    with pytest.raises(ValueError, match=r"world = 3 is outside \[0, 2\]"):
+        made.env.render(midway, 3)
+
+
+def test_pictures_show_goal_and_bands(worlds: Callable[..., Any]) -> None:
+    try:
+        open_context(16, 16).free()
+    except RenderError as error:
+        pytest.skip(f"no headless OpenGL on this machine: {error}")
+    hurdles = worlds("hurdles", num_envs=2)
+    state = hurdles.reset(0)
+    task = state.world.task
+    far = state.replace(
+        world=state.world.replace(task=task.replace(positions=task.positions + 50.0))
+    )
+    shown, bare = hurdles.env.render(state, 1), hurdles.env.render(far, 1)
+    hurdles.env.painter.close()
+    assert shown.shape == (480, 640, 3)
+    assert (np.abs(shown.astype(int) - bare).max(axis=2) > 20).mean() > 0.002

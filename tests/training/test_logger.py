@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import csv
 import io
+import re
 from pathlib import Path
 from typing import Any
 
@@ -205,6 +206,18 @@ def test_terminal_shows_a_live_panel(tmp_path: Path) -> None:
     assert "compiling train_epoch ... 0 s" in shown
     for part in ("biped-0", "500 / 1k env steps", "42.0", "0.125", "ETA"):
         assert part in shown
+
+
+def test_the_last_panel_of_a_run_of_one_epoch_shows_a_rate(tmp_path: Path, clock: FakeTime) -> None:
+    """Its only epoch is the one that was compiled, which has no rate of its own."""
+    text = io.StringIO()
+    console = Console(file=text, force_terminal=True, width=120)
+    with RunLogger(make_info(tmp_path), console=console) as logger:
+        with logger.compiling("train_epoch"):
+            clock.now += 20.0
+        logger.log(500, 1000, {"return": 42.0})
+        assert "with compilation" not in text.getvalue()
+    assert "env steps/s with compilation 25" in re.sub(r"\x1b\[[0-9;]*m", "", text.getvalue())
 
 
 class Recorder:

@@ -21,7 +21,6 @@ from twirl_mjx.bench import matmuls
 from twirl_mjx.bench.measure import (
     Chain,
     Record,
-    available_cpus,
     machine,
     progress,
     sample_rates,
@@ -31,6 +30,7 @@ from twirl_mjx.bench.worker import Worker, pinning_missing
 from twirl_mjx.checks import check_range
 from twirl_mjx.droq import learner as droq
 from twirl_mjx.droq.config import DroqConfig
+from twirl_mjx.machine import usable_cores
 from twirl_mjx.replay import mixed, ring
 
 ROWS = 50_000
@@ -80,17 +80,17 @@ class LearnerBench:
         for name in ("rounds", "obs", "action", "batch", "utd", "hidden"):
             check_range(name, getattr(self, name), 1, 1_000_000)
         check_range("seeds", self.num_seeds, 1, 1000)
-        check_range("workers", self.num_workers, 0, len(available_cpus()))
+        check_range("workers", self.num_workers, 0, len(usable_cores()))
 
     @property
     def num_seeds(self) -> int:
         """Learners on the batch axis."""
-        return max(2, len(available_cpus())) if self.seeds is None else self.seeds
+        return max(2, len(usable_cores())) if self.seeds is None else self.seeds
 
     @property
     def num_workers(self) -> int:
         """Pinned learners."""
-        return len(available_cpus()) if self.workers is None else self.workers
+        return len(usable_cores()) if self.workers is None else self.workers
 
     @property
     def droq(self) -> DroqConfig:
@@ -251,7 +251,7 @@ def measure(options: LearnerBench) -> Record:
     with contextlib.ExitStack() as stack:
         workers: list[Worker] = []
         if reasons["workers"] is None:
-            cpus = available_cpus()[: options.num_workers]
+            cpus = usable_cores()[: options.num_workers]
             alone = dataclasses.replace(options, workers=0)  # a worker sees one CPU only
             workers = [stack.enter_context(Worker(cpu, dataclasses.asdict(alone))) for cpu in cpus]
         for worker in workers:

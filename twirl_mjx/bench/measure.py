@@ -16,6 +16,7 @@ import jax
 import psutil
 
 from twirl_mjx import files
+from twirl_mjx.machine import usable_cores
 from twirl_mjx.training.rundir import versions
 
 DEFAULT_TASK = "stand"
@@ -26,13 +27,6 @@ MAX_SAMPLE_S = 1.0
 
 Record = dict[str, Any]
 """A result as JSON knows it."""
-
-
-def available_cpus() -> list[int]:
-    """Return the numbers of the CPUs this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return sorted(os.sched_getaffinity(0))
-    return list(range(os.cpu_count() or 1))
 
 
 def sample_rates(call: Callable[[], object], work: float, seconds: float) -> list[float]:
@@ -143,7 +137,7 @@ def machine() -> Record:
     """Return what the numbers depend on: processor, devices, load, versions."""
     return {
         "processor": _processor(),
-        "cpus": len(available_cpus()),
+        "cpus": len(usable_cores()),
         "memory_gb": round(psutil.virtual_memory().total / 1e9, 1),
         "devices": [f"{d.platform} {d.device_kind}" for d in jax.devices()],
         "load_before": round(os.getloadavg()[0], 2),

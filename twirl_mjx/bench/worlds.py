@@ -19,13 +19,11 @@ import jax
 import jax.numpy as jnp
 import mujoco.rollout
 import numpy as np
-from mujoco import mjx
 
 from twirl_mjx.bench.measure import (
     DEFAULT_TASK,
     Chain,
     Record,
-    available_cpus,
     machine,
     progress,
     sample_in_turn,
@@ -33,6 +31,8 @@ from twirl_mjx.bench.measure import (
     summary,
 )
 from twirl_mjx.checks import check_choice, check_range
+from twirl_mjx.machine import usable_cores
+from twirl_mjx.sim import mjx
 from twirl_mjx.sim.engine import resolve_engine
 from twirl_mjx.tasks.registry import TASKS
 from twirl_mjx.worlds.make import make
@@ -119,7 +119,7 @@ def bare_mjx(env: VectorEnv, data: mjx.Data, targets: jax.Array) -> Callable[[],
 
 def bare_native(env: VectorEnv, data: mjx.Data, targets: jax.Array) -> Callable[[], object]:
     """Return ``mujoco.rollout`` of the env's model over joint targets, a control step a call."""
-    substeps, threads = env.scene.options.n_substeps, len(available_cpus())
+    substeps, threads = env.scene.options.n_substeps, len(usable_cores())
     pool = mujoco.rollout.Rollout(nthread=threads)
     datas = [mujoco.MjData(env.mj_model) for _ in range(threads)]
     models = [env.mj_model] * env.num_envs
@@ -196,7 +196,7 @@ def envpool_rate(num_envs: int, seconds: float) -> tuple[float | None, str | Non
     if name not in envpool.list_all_envs():
         return None, f"this envpool has no {name}"
     env = envpool.make(
-        name, env_type="gymnasium", num_envs=num_envs, num_threads=len(available_cpus())
+        name, env_type="gymnasium", num_envs=num_envs, num_threads=len(usable_cores())
     )
     env.reset()
     rng = np.random.default_rng(0)

@@ -88,8 +88,7 @@ def _part(name: str, argv: list[str]) -> int:
     from twirl_mjx.bench import report
     from twirl_mjx.bench.measure import only_json_on_stdout
 
-    with contextlib.redirect_stdout(sys.stderr):  # mujoco-mjx prints while it is imported
-        module: Any = importlib.import_module(f"twirl_mjx.bench.{name}")
+    module: Any = importlib.import_module(f"twirl_mjx.bench.{name}")
     options = parse(getattr(module, f"{name.capitalize()}Bench"), argv, f"twirl bench {name}")
     with only_json_on_stdout() as out:
         record = module.measure(options)

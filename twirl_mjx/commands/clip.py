@@ -39,7 +39,8 @@ class ShowOptions:
     clips: Annotated[tuple[Path, ...], tyro.conf.Positional] = ()
     """Clip files; the shipped leap by default."""
     out: Path = Path("runs/clip")
-    """Writes <out>.png, <out>-film.mp4 and .png and, for several clips, <out>-compare.png."""
+    """Writes <out>.png, <out>-film.mp4 and .png and, for several clips, <out>-compare.png; with or
+    without the ending .png."""
     source: str = ""
     """Where the other clips come from, written into the comparison."""
 
@@ -85,7 +86,7 @@ def _show(argv: list[str], set_up: Callable[[bool], None]) -> int:
     from twirl_mjx.sim.scene import Bands, build_scene
 
     clips = [read_clip(path) for path in options.clips or (asset_path("a1", "leap.json"),)]
-    stem = options.out.parent / options.out.name
+    stem = options.out.with_suffix("") if options.out.suffix == ".png" else options.out
     show_lib.show(clips[0], f"{stem}.png")
     written = [f"{stem}.png"]
     times = np.arange(0.0, 2 * clips[0].cycle_duration, FRAME_DT)

@@ -6,17 +6,18 @@ from pathlib import Path
 
 from twirl_mjx.commands.console import say
 from twirl_mjx.commands.options import parse_train
-from twirl_mjx.policies.resolve import SCRIPTED_SOURCES
+from twirl_mjx.commands.waiting import waiting
 from twirl_mjx.tasks.imitate import ImitateOptions
-from twirl_mjx.training import pipeline, rundir
 from twirl_mjx.training.config import TrainConfig
 from twirl_mjx.training.presets import starts_from_nominal_run
-from twirl_mjx.training.sinks.registry import resolve
 
 
 def main(argv: list[str]) -> int:
     """Record a source policy in a target task as ``runs/<name>/source.npz``."""
     options = parse_train(argv, "twirl collect")
+    with waiting("loading the trainer"):  # orbax and more, which options do not need
+        from twirl_mjx.training import pipeline, rundir
+        from twirl_mjx.training.sinks.registry import resolve
     config = options.config
     check_source(config, options.preset)
     sinks = resolve(options.log)
@@ -50,6 +51,8 @@ def check_source(config: TrainConfig, preset: str) -> None:
     Raises:
         ValueError: There is nothing to record; the message lists what can be named.
     """
+    from twirl_mjx.policies.resolve import SCRIPTED_SOURCES
+
     named = config.source not in ("auto", "train")
     if named or config.task_type.source or starts_from_nominal_run(config, preset):
         return

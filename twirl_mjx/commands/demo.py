@@ -62,6 +62,7 @@ def _show(path: Path, options: DemoOptions) -> None:
     from twirl_mjx.worlds.make import make_env
 
     began = time.monotonic()
+    say(f"{path.stem}: evaluating {options.episodes} episodes" + ", then filming" * options.film)
     config = config_of(str(path), None)
     env = make_env(config, num_envs=options.episodes)
     evaluate = evaluate_policy(env, resolve_policy(str(path), config).policy)

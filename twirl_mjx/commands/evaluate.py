@@ -6,10 +6,11 @@ import dataclasses
 import sys
 import time
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
 import tyro
+from rich.box import SIMPLE
 from rich.console import Console
 from rich.table import Table
 
@@ -20,10 +21,11 @@ from twirl_mjx.commands.options import Overrides, parse_in_tasks, with_overrides
 from twirl_mjx.commands.render import config_of, name_of
 from twirl_mjx.evaluation.shifts import evaluate_shifts
 from twirl_mjx.figures.statistics import bootstrap
-from twirl_mjx.policies.resolve import Source, resolve_policy
 from twirl_mjx.sim.dynamics import PAPER_SHIFTS, SHIFTS
-from twirl_mjx.training.rundir import EVAL_COLUMNS
 from twirl_mjx.worlds.config import WorldConfig
+
+if TYPE_CHECKING:
+    from twirl_mjx.policies.resolve import Source
 
 MEDIANS = ("min_distance",)
 """Measures of which the table shows the median, as the paper does: goals lie at all distances."""
@@ -123,6 +125,8 @@ def resolve_all(options: EvaluateOptions, overrides: Overrides) -> list[Candidat
         ValueError: A file that is no policy, options of another task, or two policies that the
             table could not tell apart.
     """
+    from twirl_mjx.policies.resolve import resolve_policy
+
     candidates: dict[str, Candidate] = {}
     for given in options.policies:
         run = name_of(given)
@@ -140,12 +144,19 @@ def resolve_all(options: EvaluateOptions, overrides: Overrides) -> list[Candidat
 
 def write_rows(path: Path, rows: list[list[object]]) -> None:
     """Write a table of episodes under its header, whole or not at all."""
+    from twirl_mjx.training.rundir import EVAL_COLUMNS
+
     files.write_csv(path, [EVAL_COLUMNS, *rows])
 
 
 def _evaluate_one(candidate: Candidate, options: EvaluateOptions) -> list[list[object]]:
     """Evaluate one policy and print its table; return its rows."""
     config, found = candidate.config, candidate.found
+    conditions = len(options.shifts)
+    say(
+        f"evaluating {candidate.given} in {config.task}: {conditions} conditions x"
+        f" {options.episodes} episodes"
+    )
     began = time.monotonic()
     values = evaluate_shifts(
         config,
@@ -157,8 +168,7 @@ def _evaluate_one(candidate: Candidate, options: EvaluateOptions) -> list[list[o
     )
     wall = time.monotonic() - began
     _print_table(f"{candidate.given} in {config.task}", values)
-    conditions = len(options.shifts)
-    say(f"{conditions} conditions x {options.episodes} episodes in {wall:.1f} s, with compilation")
+    say(f"took {wall:.1f} s, with compilation")
     card = getattr(getattr(found.loaded, "header", None), "card", {})
     variant = card.get("variant", "scripted") if found.loaded else "scripted"
     trained = [variant, card.get("seed", 0), card.get("env_steps", 0)]
@@ -172,21 +182,53 @@ def _evaluate_one(candidate: Candidate, options: EvaluateOptions) -> list[list[o
 
 
 def _print_table(title: str, values: dict[str, dict[str, np.ndarray]]) -> None:
-    """Print mean of every measure, and mean and IQM of the return with a 95 % interval."""
-    measures = [m for m in next(iter(values.values())) if m != "return"]
-    titles = [f"{m} (median)" if m in MEDIANS else m for m in measures]
-    table = Table(title=title)
-    for column in ("condition", "return (mean)", "return IQM [95 %]", *titles):
-        table.add_column(column, justify="left" if column == "condition" else "right")
-    for shift, found in values.items():
-        iqm = bootstrap([found["return"]])
-        table.add_row(
-            shift,
-            f"{found['return'].mean():.1f}",
-            f"{iqm.estimate:.1f} [{iqm.low:.1f}, {iqm.high:.1f}]",
-            *(f"{(np.nanmedian if m in MEDIANS else np.nanmean)(found[m]):.3g}" for m in measures),
-        )
-    Console(width=None if sys.stdout.isatty() else 160).print(table)
+    """Print mean of every measure, and mean and IQM of the return with a 95 % interval.
+
+    A row is a measure and a column a condition; conditions that do not fit stand below.
+    """
+    console = Console(width=None if sys.stdout.isatty() else 80)
+    columns = {shift: _cells(found) for shift, found in values.items()}
+    for shown in _that_fit(columns, console.width):
+        table = Table(title=title, box=SIMPLE, padding=(0, 1))
+        table.add_column("", overflow="fold")
+        for shift in shown:
+            table.add_column(shift, justify="right", no_wrap=True)
+        for row in columns[shown[0]]:
+            table.add_row(row, *(columns[shift][row] for shift in shown))
+        console.print(table)
+
+
+def _cells(found: dict[str, np.ndarray]) -> dict[str, str]:
+    """Return the texts of one condition by the name of their row."""
+    iqm = bootstrap([found["return"]])
+    cells = {
+        "return": f"{found['return'].mean():.1f}",
+        "return IQM": f"{iqm.estimate:.1f}",
+        "  95 % from": f"{iqm.low:.1f}",
+        "  95 % to": f"{iqm.high:.1f}",
+    }
+    for name in found:
+        if name in MEDIANS:
+            cells[f"{name} (median)"] = f"{np.nanmedian(found[name]):.3g}"
+        elif name != "return":
+            cells[name] = f"{np.nanmean(found[name]):.3g}"
+    return cells
+
+
+def _that_fit(columns: dict[str, dict[str, str]], width: int) -> list[list[str]]:
+    """Return the conditions in groups whose columns fit into a width in characters, with gaps."""
+    gap = 3
+    rows = max(map(len, next(iter(columns.values())))) + gap
+    groups: list[list[str]] = []
+    room = 0
+    for shift, cells in columns.items():
+        needs = max(map(len, (shift, *cells.values()))) + gap
+        if not groups or needs > room:
+            groups.append([])
+            room = width - rows
+        groups[-1].append(shift)
+        room -= needs
+    return groups
 
 
 def _draw(table: Path, figure: Path) -> None:

@@ -15,7 +15,6 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.spatial.transform import Rotation, Slerp
 
 from twirl_mjx.sim import frames
 from twirl_mjx.sim.robot import Robot
@@ -185,6 +184,8 @@ def frame_velocities(clip: Clip) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         Linear velocity [F, 3] m/s (world), angular velocity [F, 3] rad/s (body) and joint
         velocity [F, J] rad/s.
     """
+    from scipy.spatial.transform import Rotation  # takes long to import
+
     dt = clip.frame_duration
     rotation = Rotation.from_quat(clip.root_quat, scalar_first=True)
     slopes = [
@@ -290,6 +291,8 @@ def sample(clip: ClipArrays, time: jax.Array | float) -> tuple[jax.Array, jax.Ar
 
 def configurations(clip: Clip, times: np.ndarray) -> np.ndarray:
     """Return qpos [T, 7 + J] at ``times`` [T] s: the positions of ``sample``, as float64."""
+    from scipy.spatial.transform import Rotation, Slerp  # takes long to import
+
     wraps = clip.loop == "wrap"
     cycle = np.floor(times / clip.cycle_duration) if wraps else np.zeros(len(times))
     inside = np.clip(times - cycle * clip.cycle_duration, 0.0, clip.cycle_duration)

@@ -23,7 +23,6 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from twirl_mjx import files
 from twirl_mjx.motion.clip import Clip, LoopMode, frame_velocities
@@ -176,6 +175,8 @@ def _by_corner(clip: Clip, values: np.ndarray) -> np.ndarray:
 
 def _derived(clip: Clip) -> list[np.ndarray]:
     """Return what the AMP layout adds to a frame, each [F, K]."""
+    from scipy.spatial.transform import Rotation  # takes long to import
+
     rotation = Rotation.from_quat(clip.root_quat, scalar_first=True)
     root_vel, root_ang_vel, joint_vel = frame_velocities(clip)
     arms = np.einsum("fij,flj->fli", rotation.as_matrix(), foot_arms(clip))
@@ -196,5 +197,7 @@ def foot_arms(clip: Clip) -> np.ndarray:
 
 def foot_paths(clip: Clip) -> np.ndarray:
     """Return the foot centres [F, 4, 3] m in the world frame."""
+    from scipy.spatial.transform import Rotation  # takes long to import
+
     rotation = Rotation.from_quat(clip.root_quat, scalar_first=True).as_matrix()
     return clip.root_pos[:, None] + np.einsum("fij,flj->fli", rotation, foot_arms(clip))

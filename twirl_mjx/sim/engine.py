@@ -9,7 +9,6 @@ from __future__ import annotations
 import functools
 import itertools
 import math
-import os
 import threading
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal, Protocol
@@ -20,9 +19,9 @@ import jax.numpy as jnp
 import mujoco
 import mujoco.rollout
 import numpy as np
-from mujoco import mjx
 
-from twirl_mjx.sim import actuation
+from twirl_mjx.machine import usable_cores
+from twirl_mjx.sim import actuation, mjx
 from twirl_mjx.sim.actuation import MOTOR_PLACES, MotorCommand
 from twirl_mjx.sim.dynamics import LEAVES, Dynamics, Target, targets, trunk
 from twirl_mjx.sim.scene import Scene
@@ -75,7 +74,7 @@ def make_engine(name: EngineName, scene: Scene, threads: int | None = None) -> E
         raise ValueError(f"unknown engine {name!r}: choose auto, mjx or native")
     if resolve_engine(name) == "mjx":
         return MjxEngine(scene)
-    return NativeEngine(scene, threads or len(os.sched_getaffinity(0)))
+    return NativeEngine(scene, threads or len(usable_cores()))
 
 
 def make_data(scene: Scene, num_envs: int) -> mjx.Data:

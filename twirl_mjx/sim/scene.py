@@ -12,9 +12,8 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from mujoco import mjx
 
-from twirl_mjx.sim import look
+from twirl_mjx.sim import look, mjx
 from twirl_mjx.sim.dynamics import HILL_ANGLE, SceneKind
 from twirl_mjx.sim.mjcf import robot_spec
 from twirl_mjx.sim.robot import BODY_CLASSES, CALF, CONTROL_DT, FOOT, Robot

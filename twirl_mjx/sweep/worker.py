@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import fcntl
 import os
 import platform
 import signal
@@ -16,6 +15,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+from twirl_mjx.machine import CAN_PIN, try_lock, usable_cores
 from twirl_mjx.sweep import launch
 
 POLL_S = 0.5
@@ -55,14 +55,12 @@ def claim_core() -> Iterator[int | None]:
     Yields:
         The core; None when the machine cannot pin or every core is held.
     """
-    cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
+    cores = usable_cores() if CAN_PIN else []
     folder = Path(tempfile.gettempdir()) / f"twirl_mjx-cores-{os.getuid()}"
     folder.mkdir(mode=0o700, exist_ok=True)
     for core in cores:
         with (folder / f"{core}.lock").open("a") as file:
-            try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
+            if not try_lock(file):
                 continue
             yield core
             return

@@ -21,7 +21,6 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from twirl_mjx.assets import asset_path
 from twirl_mjx.checks import check_range
@@ -98,6 +97,8 @@ def load_clip(name: str, robot: Robot = A1) -> Clip:
 
 def facing_x(clip: Clip) -> Clip:
     """Return the clip turned about the world z-axis so that its mean heading is +x."""
+    from scipy.spatial.transform import Rotation  # takes long to import
+
     yaw = headings(clip.root_quat)
     mean = np.arctan2(np.sin(yaw).mean(), np.cos(yaw).mean())
     turn = Rotation.from_euler("z", -mean)

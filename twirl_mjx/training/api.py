@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from twirl_mjx.cache import use_cache
 from twirl_mjx.policies.learned import load_policy
 from twirl_mjx.policies.resolve import Source
 from twirl_mjx.tasks.registry import TASKS
@@ -82,6 +83,7 @@ def train(
         ValueError: An unknown name or a value out of range, with the nearest valid choice.
         StoppedError: A signal stopped it after saving; the same call resumes.
     """
+    use_cache()
     registered = task if isinstance(task, str) else TASKS.register(task).name
     preset = preset or default_preset()
     flat: dict[str, Any] = {}

@@ -215,8 +215,7 @@ def _nominal_run(config: TrainConfig, preset: str, runs_dir: Path) -> RunDir:
 
 
 def _nominal_dir(config: TrainConfig, preset: str, runs_dir: Path) -> RunDir:
-    variant = make_config(config.task, preset).variant
-    nominal = dataclasses.replace(config, shift="none", variant=variant)
+    nominal = dataclasses.replace(make_config(config.task, preset), seed=config.seed)
     return RunDir(runs_dir / rundir.default_name(nominal, preset))
 
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import fcntl
 import functools
 import hashlib
 import importlib.metadata
 import json
 import os
 import platform
+import re
 import subprocess
 import time
 from collections.abc import Iterator
@@ -20,11 +20,13 @@ from typing import Any
 import numpy as np
 
 from twirl_mjx import exits, files
+from twirl_mjx.machine import try_lock
 from twirl_mjx.policies.learned import BEST_POLICY, LAST_POLICY
 from twirl_mjx.tasks.measures import episode_means
 from twirl_mjx.training import config_json
 from twirl_mjx.training.checkpoint import has_checkpoint, newest_checkpoint
 from twirl_mjx.training.config import TrainConfig
+from twirl_mjx.training.presets import make_config
 
 PACKAGES = (
     "twirl-mjx", "mujoco", "mujoco-mjx", "jax", "jaxlib", "brax", "flax", "optax",
@@ -33,6 +35,8 @@ PACKAGES = (
 MAY_CHANGE = ("total_env_steps:", "checkpoint_minutes:", "eval.", "engine:", "source:", "uses:")
 """How the lines of a difference begin that a resumed run may have: they do not alter what was done
 so far. (``source`` is judged by its digest.)"""
+MOST_WORDS = 3
+"""Settings that the default name of a run spells out; more are a digest."""
 EVAL_COLUMNS = (
     "run", "task", "shift", "variant", "seed", "env_steps", "episode", "metric", "value",
 )  # fmt: skip
@@ -332,7 +336,7 @@ class RunDir:
         self.path.mkdir(parents=True, exist_ok=True)
         with self.lock.open("a+") as file:
             deadline = time.monotonic() + wait_s
-            while not _try_lock(file.fileno(), fcntl.LOCK_EX):
+            while not try_lock(file):
                 if time.monotonic() > deadline:
                     raise self.busy()
                 time.sleep(0.1)
@@ -357,7 +361,7 @@ class RunDir:
         if not self.lock.is_file():
             return None
         with self.lock.open() as file:
-            return None if _try_lock(file.fileno(), fcntl.LOCK_SH) else file.read() or "a process"
+            return None if try_lock(file, shared=True) else file.read() or "a process"
 
 
 def _is_header_only(path: Path) -> bool:
@@ -371,15 +375,6 @@ def _is_header_only(path: Path) -> bool:
 
 def _sum(content: bytes) -> str:
     return hashlib.sha256(content).hexdigest()
-
-
-def _try_lock(descriptor: int, kind: int) -> bool:
-    """Try to take a lock that the kernel releases when the file is closed or the process ends."""
-    try:
-        fcntl.flock(descriptor, kind | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    return True
 
 
 def check_name(name: str) -> str:
@@ -398,9 +393,34 @@ def check_name(name: str) -> str:
 
 
 def default_name(config: TrainConfig, preset: str) -> str:
-    """Return the name of a run when none is given."""
+    """Return the name of a run when none is given: that of its preset, and what departs from it.
+
+    What a resumed run may change is no part of it, so the same command resumes.
+    """
     shift = "" if config.shift == "none" else f"-{config.shift}"
-    return f"{config.task}{shift}-{config.variant.replace('+', '_')}-{preset}-s{config.seed}"
+    plain = f"{config.task}{shift}-{config.variant.replace('+', '_')}-{preset}-s{config.seed}"
+    return "-".join([plain, *_words(_settings(config, preset))])
+
+
+def _settings(config: TrainConfig, preset: str) -> dict[str, Any]:
+    """Return the settings by which a run departs from its preset, by their public names."""
+    usual = config_json.flatten(make_config(config.task, preset, config.learner))
+    said = ("task", "shift", "variant", "seed")  # they are in the name
+    free = tuple(name for name in may_change(config) if name != "source:")
+    return {
+        name: value
+        for name, value in config_json.flatten(config).items()
+        if value != usual.get(name) and name not in said and not f"{name}:".startswith(free)
+    }
+
+
+def _words(settings: dict[str, Any]) -> list[str]:
+    """Return settings as short parts of a file name, as a digest where they are many or long."""
+    words = [f"{name.split('.')[-1]}_{value}" for name, value in settings.items()]
+    if len(words) <= MOST_WORDS and all(re.fullmatch(r"[\w.]{1,32}", word) for word in words):
+        return words
+    text = json.dumps(settings, sort_keys=True, default=str)
+    return [hashlib.sha256(text.encode()).hexdigest()[:8]]
 
 
 def digest(config: TrainConfig) -> str:

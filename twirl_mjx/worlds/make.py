@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import dataclasses
+import pickle
 from collections.abc import Mapping
 from typing import Any
 
 from twirl_mjx import records
+from twirl_mjx.cache import use_cache
 from twirl_mjx.sim.dynamics import SceneKind, get_shift
 from twirl_mjx.sim.engine import make_engine
 from twirl_mjx.sim.scene import SimOptions, build_scene
 from twirl_mjx.tasks.registry import TASKS
 from twirl_mjx.tasks.task import Task
 from twirl_mjx.worlds.check import check_task
-from twirl_mjx.worlds.config import DynamicsOverrides, WorldConfig, world_fields
+from twirl_mjx.worlds.config import REGISTRIES, DynamicsOverrides, WorldConfig, world_fields
 from twirl_mjx.worlds.vector import VectorEnv
 
 
@@ -48,6 +50,7 @@ def _bind(
 ) -> VectorEnv:
     kind = scene_kind or get_shift(config.shift).scene
     scene = build_scene(kind, robot=task.robot, collision=task.collision, options=SimOptions())
+    how = (num_envs, scene_kind, threads)
     return VectorEnv(
         task,
         scene,
@@ -57,7 +60,17 @@ def _bind(
         dynamics=config.make_dynamics(),
         metric_names=check_task(task, scene),
         ranges=config.ranges,
-    )
+    ).made_by(lambda: (_again, (config.uses, pickle.dumps(config), how)))
+
+
+def _again(uses: tuple[str, ...], pickled: bytes, how: tuple[Any, Any, Any]) -> VectorEnv:
+    """Return worlds of a pickled config, whose classes may come from a user's files."""
+    for reference in uses:
+        for registry in REGISTRIES:
+            registry.admit_if_fits(reference)
+    num_envs, scene_kind, threads = how
+    config = pickle.loads(pickled)
+    return make_env(config, num_envs=num_envs, scene_kind=scene_kind, threads=threads)
 
 
 def make(
@@ -84,6 +97,7 @@ def make(
     Raises:
         ValueError: An unknown name or a value out of range, with the nearest valid choice.
     """
+    use_cache()
     if isinstance(task, Task):
         options = task.options if options is None else options
     kind = task if isinstance(task, type) else type(task)

@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import functools
+import pickle
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
 
 import flax.struct
 import jax
 import jax.numpy as jnp
 import mujoco
-from mujoco import mjx
+import numpy as np
 
-from twirl_mjx.sim import actuation
+from twirl_mjx.checks import check_range
+from twirl_mjx.sim import actuation, mjx
 from twirl_mjx.sim.dynamics import Dynamics, broadcast, leaf_value
 from twirl_mjx.sim.engine import Engine, Trace, make_data, world_model
 from twirl_mjx.sim.ranges import NO_RANGES, Ranges, draw
@@ -20,6 +24,11 @@ from twirl_mjx.tasks.observations import layout_noise, layout_size
 from twirl_mjx.tasks.task import Task
 from twirl_mjx.types import Metrics, Transition
 
+if TYPE_CHECKING:
+    import gymnasium
+
+    from twirl_mjx.worlds.picture import Painter
+
 MAX_STATE = 1e4
 """A world whose position or velocity exceeds this (SI units) counts as diverged."""
 
@@ -27,8 +36,14 @@ DRAW, NOISE, PUSH = 1001, 1002, 1003
 """What is folded into a world's key for draws that only some worlds make: the others' numbers do
 not depend on them. Beyond the numbers of the keys that a split gives."""
 
+OBSERVATION_LIMIT = 10 * MAX_STATE
+"""Bound of the observation space, in the units of the layout: no finite world ever reaches it."""
+
 PHYSICS_STATE = ("time", "qpos", "qvel", "ctrl", "qacc_warmstart")
 """Fields of ``mjx.Data`` that the next step depends on; it computes the others anew."""
+
+Recipe = Callable[[], tuple[Callable[..., Any], tuple[Any, ...]]]
+"""Returns what makes worlds, and the arguments to make them with; both can be pickled."""
 
 Live = tuple[dict[str, jax.Array], World, jax.Array]
 """What a restart changes: ``PHYSICS_STATE``, the rest of the worlds, what the policy sees."""
@@ -64,7 +79,11 @@ class EnvState(flax.struct.PyTreeNode):
 
 
 class VectorEnv:
-    """N worlds of one task in one scene; holds constants only, all methods are pure."""
+    """N worlds of one task in one scene; holds constants only, all methods are pure.
+
+    ``reset`` and ``step`` are compiled when they are called with arrays, and become part of the
+    caller's program under ``jax.jit``, ``vmap`` and ``scan``.
+    """
 
     def __init__(
         self,
@@ -102,6 +121,30 @@ class VectorEnv:
         self.episode_length = episode_length
         self.dynamics = broadcast(dynamics, num_envs)
         self.ranges = ranges
+        self._recipe: Recipe | None = None
+
+    def __repr__(self) -> str:
+        name = type(self.engine).__name__.removesuffix("Engine").lower()
+        drawn = f", drawn: {' '.join(self.ranges.texts())}" if self.ranges else ""
+        return (
+            f"<VectorEnv {self.task.name}: {self.num_envs} worlds on {self.scene.kind} ground,"
+            f" robot {self.scene.robot.name}, engine {name}; observation"
+            f" [{self.observation_size}], action [{self.action_size}] in [-1, 1],"
+            f" {1 / self.control_dt:g} Hz, episodes of {self.episode_length} steps{drawn}>"
+        )
+
+    def made_by(self, recipe: Recipe) -> VectorEnv:
+        """Keep how to make these worlds again, which is how they are pickled; return them."""
+        self._recipe = recipe
+        return self
+
+    def __reduce__(self) -> tuple[Callable[..., Any], tuple[Any, ...]]:
+        if self._recipe is None:
+            raise pickle.PicklingError(
+                "only worlds of twirl_mjx.make and make_env can be pickled: these were put"
+                " together by hand"
+            )
+        return self._recipe()
 
     @property
     def observation_size(self) -> int:
@@ -117,6 +160,46 @@ class VectorEnv:
     def control_dt(self) -> float:
         """Control step in s."""
         return self.scene.robot.control_dt
+
+    @functools.cached_property
+    def observation_space(self) -> gymnasium.spaces.Box:
+        """What one world shows, float32 [O], as gymnasium says it."""
+        import gymnasium
+
+        limit = float(OBSERVATION_LIMIT)
+        return gymnasium.spaces.Box(-limit, limit, (self.observation_size,), np.float32)
+
+    @functools.cached_property
+    def action_space(self) -> gymnasium.spaces.Box:
+        """What one world takes, float32 [A] in [-1, 1], as gymnasium says it."""
+        import gymnasium
+
+        return gymnasium.spaces.Box(-1.0, 1.0, (self.action_size,), np.float32)
+
+    @functools.cached_property
+    def painter(self) -> Painter:
+        """Draws these worlds, under the default physical parameters of world 0."""
+        from twirl_mjx.worlds.picture import Painter
+
+        return Painter(self.scene, jax.tree.map(lambda leaf: leaf[0], self.dynamics))
+
+    def render(self, state: EnvState, world: int = 0) -> np.ndarray:
+        """Return an image [480, 640, 3] uint8 of one world.
+
+        Args:
+            state: A state of these worlds.
+            world: Which one.
+
+        Raises:
+            ValueError: There is no such world.
+            RenderError: No OpenGL backend works.
+        """
+        check_range("world", world, 0, self.num_envs - 1)
+        one = jax.tree.map(lambda leaf: leaf[world], (state.world.task, state.world.goal))
+        task, goal = one
+        qpos = np.asarray(state.data.qpos[world], np.float64)
+        shown = np.asarray(goal) if self.task.shows_goal else None
+        return self.painter.draw(qpos, self.task.bands(task), shown)
 
     @functools.cached_property
     def mj_model(self) -> mujoco.MjModel:
@@ -140,6 +223,16 @@ class VectorEnv:
         Returns:
             A state whose ``next_obs`` equals ``obs``, with reward 0 and all flags false.
         """
+        run = self._reset if _is_traced(key, dynamics, index) else self._compiled_reset
+        return run(key, dynamics, index)
+
+    @functools.cached_property
+    def _compiled_reset(self) -> Callable[..., EnvState]:
+        return jax.jit(self._reset)
+
+    def _reset(
+        self, key: jax.Array, dynamics: Dynamics | None, index: jax.Array | None
+    ) -> EnvState:
         dynamics = self.dynamics if dynamics is None else broadcast(dynamics, self.num_envs)
         index = jnp.arange(self.num_envs) if index is None else index
         keys = jax.vmap(jax.random.fold_in, (None, 0))(key, index)
@@ -172,6 +265,14 @@ class VectorEnv:
         need = (self.num_envs, self.action_size)
         if jnp.shape(action) != need:
             raise ValueError(f"action has shape {jnp.shape(action)}, need {need}")
+        run = self._step if _is_traced(state, action) else self._compiled_step
+        return run(state, action)
+
+    @functools.cached_property
+    def _compiled_step(self) -> Callable[[EnvState, jax.Array], EnvState]:
+        return jax.jit(self._step)
+
+    def _step(self, state: EnvState, action: jax.Array) -> EnvState:
         finite_action = jnp.all(jnp.isfinite(action), axis=-1)
         action = jnp.clip(jnp.nan_to_num(action.astype(jnp.float32)), -1.0, 1.0)
         world, command = jax.vmap(self._command)(state.world, state.data.ctrl, action)
@@ -282,6 +383,11 @@ class VectorEnv:
         fresh = {name: jnp.zeros_like(leaf) for name, leaf in physics.items()}
         fresh |= {"qpos": qpos, "qvel": qvel, "ctrl": qpos[:, 7:]}
         return _select(done, (fresh, fresh_world, fresh_obs), live)
+
+
+def _is_traced(*tree: Any) -> bool:
+    """Return whether any leaf is being traced by jax."""
+    return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(tree))
 
 
 def _key_now(world: World, stream: int) -> jax.Array:

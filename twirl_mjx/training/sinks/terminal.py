@@ -84,6 +84,8 @@ class Terminal:
         self._headlines = headlines(run)
         self._values: dict[str, float] = {}
         self._env_steps, self._grad_steps = run.resume_env_steps or 0, 0
+        self._opened = (time.monotonic(), self._env_steps)
+        self._overall: float | None = None
         self._history = deque([(time.monotonic(), self._env_steps)], maxlen=RATE_WINDOW)
         if self._console.is_terminal:
             self._live = Live(
@@ -97,8 +99,16 @@ class Terminal:
     def close(self) -> None:
         """End the live display and leave its last state on the screen."""
         if self._live is not None:
+            if "env_steps_per_s" not in self._values:
+                self._overall = self._rate_since_open()
             self._live.stop()
             self._live = None
+
+    def _rate_since_open(self) -> float | None:
+        """Return transitions per second of the whole stage, None before there are any."""
+        began, first = self._opened
+        seconds = time.monotonic() - began
+        return (self._env_steps - first) / seconds if self._env_steps > first else None
 
     def announce(self, text: str) -> None:
         """Print one line above the display."""
@@ -143,11 +153,15 @@ class Terminal:
 
     def _texts(self) -> list[tuple[str, str]]:
         """Return (label, text) of the headlines that are known."""
-        return [
+        known = [
             (label, form.format(self._values[name]))
             for name, (label, form) in self._headlines.items()
             if name in self._values
         ]
+        if self._overall is None:
+            return known
+        label, form = TRAINING["env_steps_per_s"]
+        return [(f"{label} with compilation", form.format(self._overall)), *known]
 
     def _render(self) -> RenderableType:
         """Build the live panel."""

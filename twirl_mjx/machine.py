@@ -1,0 +1,47 @@
+"""What differs between operating systems: cores and locks. Linux and macOS have both."""
+
+from __future__ import annotations
+
+import os
+import sys
+from typing import TextIO
+
+UNSUPPORTED = (
+    "Windows has not what this needs (process locks and signals): run it in WSL, the Linux that"
+    " Windows brings (`wsl --install`)"
+)
+CAN_PIN = hasattr(os, "sched_setaffinity")
+"""Whether a process can be bound to cores here."""
+
+
+def is_supported() -> bool:
+    """Return whether this operating system is one of those that are supported."""
+    return sys.platform != "win32"
+
+
+def usable_cores() -> list[int]:
+    """Return the numbers of the cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return sorted(os.sched_getaffinity(0))
+    return list(range(os.cpu_count() or 1))
+
+
+def try_lock(file: TextIO, *, shared: bool = False) -> bool:
+    """Try to take a lock that the kernel releases when the file is closed or the process ends.
+
+    Args:
+        file: An open file; it stays as it is.
+        shared: A lock that others may share, which finds out whether somebody holds it alone.
+
+    Raises:
+        OSError: There are no such locks on this operating system.
+    """
+    if not is_supported():
+        raise OSError(UNSUPPORTED)
+    import fcntl
+
+    try:
+        fcntl.flock(file.fileno(), (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True

@@ -1,0 +1,232 @@
+"""What lies in a folder of runs, read without jax: names, states, best returns, sizes.
+
+Nothing here judges whether a run may go on; that is ``rundir.RunDir.status``.
+"""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import shutil
+import time
+from collections.abc import Iterable, Sequence
+from fnmatch import fnmatch
+from pathlib import Path
+from typing import Any, Literal
+
+from twirl_mjx import files
+from twirl_mjx.checks import choose_one
+from twirl_mjx.machine import try_lock
+
+State = Literal["running", "finished", "stopped", "empty", "damaged"]
+STATES: tuple[State, ...] = ("running", "finished", "stopped", "empty", "damaged")
+"""A process works there; closed by its evaluation; can be resumed; nothing done yet; no config."""
+CONFIG, METRICS, EPISODES = "config.json", "metrics.csv", "eval.csv"
+CHECKPOINTS, DATASET = "checkpoints", "source.npz"
+PRUNED = (CHECKPOINTS, DATASET)
+"""What a finished run can do without: training states with the replay, and collected experience."""
+TAIL = 1 << 16
+"""Bytes at the end of a table in which its last row is looked for."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Overview:
+    """One run as it lies on disk."""
+
+    path: Path
+    """Its directory."""
+    state: State
+    """See ``STATES``."""
+    settings: dict[str, Any]
+    """Its config, flat, by public names; empty when that cannot be read."""
+    env_steps: int
+    """Transitions so far."""
+    best_return: float | None
+    """Highest mean return of an evaluation while it trained, or of the closing one."""
+    measures: dict[str, float]
+    """Means over the closing episodes."""
+    wall_s: float
+    """s, time it has trained."""
+    changed: float
+    """Time of the newest change, s since the epoch."""
+    size: int
+    """Bytes of all its files."""
+    prunable: int
+    """Bytes of ``PRUNED`` among them."""
+
+    @property
+    def name(self) -> str:
+        """Name of the run."""
+        return self.path.name
+
+    def setting(self, name: str) -> Any:
+        """Return a setting, ``?`` where it is not known."""
+        return self.settings.get(name, "?")
+
+
+def find(folder: Path, patterns: Sequence[str] = ()) -> list[Path]:
+    """Return the run directories of a folder whose names match any of the patterns; all by default.
+
+    A pattern may also be the path of a run directory.
+
+    Raises:
+        FileNotFoundError: A pattern matches nothing; the message names the nearest.
+    """
+    known = sorted(path.parent for path in folder.glob(f"*/{CONFIG}"))
+    if not patterns:
+        return known
+    found: dict[Path, None] = {}
+    for pattern in patterns:
+        path = Path(pattern)
+        here = [path] if (path / CONFIG).exists() else []
+        matching = here or [p for p in known if fnmatch(p.name, pattern)]
+        if not matching:
+            choices = choose_one(path.name, [p.name for p in known])
+            raise FileNotFoundError(f"no run {pattern!r} in {folder}: {choices}")
+        found |= dict.fromkeys(matching)
+    return list(found)
+
+
+def look(path: Path) -> Overview:
+    """Return how a run stands."""
+    settings = _settings(path / CONFIG)
+    measures = means(path / EPISODES)
+    last, best = _curve(path / METRICS)
+    closing = measures.get("return")
+    sizes = {p: p.stat() for p in path.rglob("*") if p.is_file() and not p.is_symlink()}
+    closed = _last_row(path / EPISODES)
+    return Overview(
+        path=path,
+        state=_state(path, settings),
+        settings=settings,
+        env_steps=int(float((closed or last).get("env_steps", 0))),
+        best_return=max((v for v in (best, closing) if v is not None), default=None),
+        measures=measures,
+        wall_s=float(last.get("wall_s", 0.0)),
+        changed=max((s.st_mtime for s in sizes.values()), default=path.stat().st_mtime),
+        size=sum(s.st_size for s in sizes.values()),
+        prunable=sum(s.st_size for p, s in sizes.items() if p.relative_to(path).parts[0] in PRUNED),
+    )
+
+
+def _state(path: Path, settings: dict[str, Any]) -> State:
+    if is_held(path):
+        return "running"
+    if not settings:
+        return "damaged"
+    if (path / EPISODES).is_file():
+        return "finished"
+    work = (CHECKPOINTS, METRICS, DATASET)
+    return "stopped" if any((path / name).exists() for name in work) else "empty"
+
+
+def is_held(path: Path) -> bool:
+    """Return whether a process works in a run directory."""
+    lock = path / ".lock"
+    if not lock.is_file():
+        return False
+    with lock.open() as file:
+        return not try_lock(file, shared=True)
+
+
+def _settings(path: Path) -> dict[str, Any]:
+    try:
+        record = files.read_json(path, "the config of a run")
+    except (OSError, ValueError):  # shown as damaged
+        return {}
+    return dict(_flat(record)) if isinstance(record, dict) else {}
+
+
+def _flat(record: dict[str, Any], before: str = "") -> Iterable[tuple[str, Any]]:
+    for key, value in record.items():
+        if isinstance(value, dict):
+            yield from _flat(value, f"{before}{key}.")
+        else:
+            yield f"{before}{key}", value
+
+
+def means(path: Path) -> dict[str, float]:
+    """Return the means of a table of episodes by measure; empty where there is none."""
+    if not path.is_file():
+        return {}
+    values: dict[str, list[float]] = {}
+    with path.open(newline="", encoding="utf-8") as file:
+        for row in csv.DictReader(file):
+            values.setdefault(row["metric"], []).append(float(row["value"]))
+    return {name: sum(column) / len(column) for name, column in values.items()}
+
+
+def _curve(path: Path) -> tuple[dict[str, str], float | None]:
+    """Return the last row of a run's metrics and the best mean return of an evaluation."""
+    if not path.is_file():
+        return {}, None
+    last: dict[str, str] = {}
+    best: float | None = None
+    with path.open(newline="", encoding="utf-8") as file:
+        for row in csv.DictReader(file):
+            if row["value"] in (None, ""):  # being written
+                break
+            last = row
+            if row["metric"] == "eval/return":
+                value = float(row["value"])
+                best = value if best is None else max(best, value)
+    return last, best
+
+
+def _last_row(path: Path) -> dict[str, str]:
+    if not path.is_file():
+        return {}
+    with path.open(newline="", encoding="utf-8") as file:
+        return next(csv.DictReader(file), {})
+
+
+def differences(runs: Sequence[Overview]) -> dict[str, list[Any]]:
+    """Return the settings in which runs differ: name -> value in every run, None where unknown."""
+    names = dict.fromkeys(name for run in runs for name in run.settings)
+    rows = {name: [run.settings.get(name) for run in runs] for name in names}
+    return {name: row for name, row in rows.items() if any(v != row[0] for v in row[1:])}
+
+
+def prune(run: Overview) -> int:
+    """Delete what a finished run can do without; never a policy, table or config.
+
+    Returns:
+        Bytes that were deleted.
+
+    Raises:
+        ValueError: The run is not finished: it could not be resumed any more.
+        RuntimeError: A process works there.
+    """
+    if run.state != "finished":
+        raise ValueError(f"{run.path} is {run.state}, and only finished runs are pruned")
+    with (run.path / ".lock").open("a+") as file:
+        if not try_lock(file):
+            raise RuntimeError(f"{run.path} is in use by another process")
+        for name in PRUNED:
+            target = run.path / name
+            if target.is_symlink() or target.is_file():
+                target.unlink()
+            elif target.is_dir():
+                shutil.rmtree(target)
+    return run.prunable
+
+
+def age(seconds: float) -> str:
+    """Return a time span briefly: 40 s, 5 min, 3 h, 12 d."""
+    for limit, unit, name in ((120, 1, "s"), (7200, 60, "min"), (172_800, 3600, "h")):
+        if seconds < limit:
+            return f"{seconds / unit:.0f} {name}"
+    return f"{seconds / 86_400:.0f} d"
+
+
+def age_of(run: Overview) -> str:
+    """Return how long ago a run changed."""
+    return age(max(0.0, time.time() - run.changed))
+
+
+def size_text(count: int) -> str:
+    """Return a number of bytes briefly: 3 kB, 12 MB, 0.8 GB."""
+    for limit, unit, form in ((1e6, "kB", "{:.0f}"), (1e8, "MB", "{:.0f}"), (1e12, "GB", "{:.1f}")):
+        if count < limit:
+            return f"{form.format(count / {'kB': 1e3, 'MB': 1e6, 'GB': 1e9}[unit])} {unit}"
+    return f"{count / 1e12:.1f} TB"
