@@ -255,6 +255,7 @@ def test_rows(tmp_path: Path) -> None:
 APPENDS = {
     ("training/metrics.py", 1): "metrics.csv grows",
     ("training/rundir.py", 2): "the lock of a run directory",
+    ("training/overview.py", 2): "the lock of a run directory",
     ("sweep/worker.py", 2): "locks of cores, and the log of a run",
     ("bench/startup.py", 1): "the output of a child process",
 }

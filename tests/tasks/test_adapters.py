@@ -274,3 +274,15 @@ def test_brax_view_of_many_worlds() -> None:
     single = jax.eval_shape(to_brax("biped").reset, jax.random.key(0))
     assert single.obs.shape == (101,)
     assert single.done.shape == ()
+
+
+def test_brax_wrappers_count_on_raw_keys() -> None:
+    """As docs/adapters.md says: typed keys lack the axis that brax's episode wrapper drops."""
+    from brax.envs.wrappers import training
+
+    wrapped = training.wrap(to_brax("stand", engine="native"), episode_length=2)
+    counts = [
+        jax.eval_shape(wrapped.reset, jax.random.split(make(0), 2)).info["steps"].shape
+        for make in (jax.random.PRNGKey, jax.random.key)
+    ]
+    assert counts == [(2,), ()]

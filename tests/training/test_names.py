@@ -29,7 +29,7 @@ def test_a_plain_preset_has_its_plain_name(preset: str) -> None:
 def test_what_departs_is_in_the_name() -> None:
     assert named(source="trot") == "biped-twirl-cpu-s0-source_trot"
     assert named(replay__phi=0.25, droq__utd=1.0) == "biped-twirl-cpu-s0-utd_1.0-phi_0.25"
-    assert named(num_envs=8) == "biped-twirl-cpu-s0-num_envs_8"
+    assert named(num_envs=32) == "biped-twirl-cpu-s0-num_envs_32"
     assert named(biped__goal_distance=1.0) == "biped-twirl-cpu-s0-goal_distance_1.0"
 
 

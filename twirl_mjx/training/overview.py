@@ -7,9 +7,10 @@ from __future__ import annotations
 
 import csv
 import dataclasses
+import io
 import shutil
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any, Literal
@@ -25,8 +26,6 @@ CONFIG, METRICS, EPISODES = "config.json", "metrics.csv", "eval.csv"
 CHECKPOINTS, DATASET = "checkpoints", "source.npz"
 PRUNED = (CHECKPOINTS, DATASET)
 """What a finished run can do without: training states with the replay, and collected experience."""
-TAIL = 1 << 16
-"""Bytes at the end of a table in which its last row is looked for."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -94,7 +93,7 @@ def look(path: Path) -> Overview:
     last, best = _curve(path / METRICS)
     closing = measures.get("return")
     sizes = {p: p.stat() for p in path.rglob("*") if p.is_file() and not p.is_symlink()}
-    closed = _last_row(path / EPISODES)
+    closed = _first_row(path / EPISODES)
     return Overview(
         path=path,
         state=_state(path, settings),
@@ -150,9 +149,8 @@ def means(path: Path) -> dict[str, float]:
     if not path.is_file():
         return {}
     values: dict[str, list[float]] = {}
-    with path.open(newline="", encoding="utf-8") as file:
-        for row in csv.DictReader(file):
-            values.setdefault(row["metric"], []).append(float(row["value"]))
+    for row in _rows(path):
+        values.setdefault(row["metric"], []).append(float(row["value"]))
     return {name: sum(column) / len(column) for name, column in values.items()}
 
 
@@ -162,22 +160,26 @@ def _curve(path: Path) -> tuple[dict[str, str], float | None]:
         return {}, None
     last: dict[str, str] = {}
     best: float | None = None
-    with path.open(newline="", encoding="utf-8") as file:
-        for row in csv.DictReader(file):
-            if row["value"] in (None, ""):  # being written
-                break
-            last = row
-            if row["metric"] == "eval/return":
-                value = float(row["value"])
-                best = value if best is None else max(best, value)
+    for row in _rows(path):
+        if row["value"] in (None, ""):  # being written
+            break
+        last = row
+        if row["metric"] == "eval/return":
+            value = float(row["value"])
+            best = value if best is None else max(best, value)
     return last, best
 
 
-def _last_row(path: Path) -> dict[str, str]:
+def _rows(path: Path) -> Iterator[dict[str, str]]:
+    """Yield the rows of a table; the last may be cut where it is being written."""
+    text = files.read_text(path, "a table of a run", files.SIZE_LIMIT)
+    return iter(csv.DictReader(io.StringIO(text, newline="")))
+
+
+def _first_row(path: Path) -> dict[str, str]:
     if not path.is_file():
         return {}
-    with path.open(newline="", encoding="utf-8") as file:
-        return next(csv.DictReader(file), {})
+    return next(_rows(path), {})
 
 
 def differences(runs: Sequence[Overview]) -> dict[str, list[Any]]:
