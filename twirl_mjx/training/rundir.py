@@ -29,9 +29,12 @@ PACKAGES = (
     "twirl-mjx", "mujoco", "mujoco-mjx", "jax", "jaxlib", "brax", "flax", "optax",
     "orbax-checkpoint", "numpy",
 )  # fmt: skip
-MAY_CHANGE = ("total_env_steps:", "checkpoint_minutes:", "eval.", "engine:", "source:", "uses:")
+MAY_CHANGE = (
+    "total_env_steps:", "checkpoint_minutes:", "eval.", "engine:", "source:", "uses:",
+    "source_contract:", "source_command:", "allow_clipping:",
+)  # fmt: skip
 """How the lines of a difference begin that a resumed run may have: they do not alter what was done
-so far. (``source`` is judged by its digest.)"""
+so far. (``source`` and its terms are judged by its digest.)"""
 EVAL_COLUMNS = (
     "run", "task", "shift", "variant", "seed", "env_steps", "episode", "metric", "value",
 )  # fmt: skip
@@ -161,9 +164,19 @@ class RunDir:
         """
         if not self._is_held and self.owner():
             return Busy(self.busy())
-        work = (self.dataset, self.checkpoints, self.metrics, self.policy, self.episodes)
-        if not self.config.exists() or not any(path.exists() for path in work):
+        work = (
+            self.dataset, self.checkpoints, self.metrics, self.policy, self.last_policy,
+            self.episodes,
+        )  # fmt: skip
+        there = [path.name for path in work if path.exists()]
+        if not there:
             return New()
+        if not self.config.exists():
+            return Foreign(RunMismatchError(
+                f"{self} holds {', '.join(there)} and no {self.config.name}: no run wrote them, and"
+                " nothing was touched (nearest: another --name, or move them; recorded data can be"
+                f" the source of a run: --source {self.dataset})"
+            ))  # fmt: skip
         if lines := self._differences(config, source):
             shown = "\n  ".join(lines)
             return Foreign(RunMismatchError(
