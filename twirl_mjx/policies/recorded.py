@@ -161,13 +161,14 @@ def _plain(path: Path, observation_size: int, action_size: int, task: str) -> Tr
     for name in TRUNCATIONS:
         if name in arrays and arrays[name].reshape(-1).shape != (count,):
             raise DatasetError(f"{path}: {name} has shape {arrays[name].shape}, need ({count},)")
-    return Transition(
-        obs=found["obs"].astype(np.float32),
-        action=np.clip(found["action"], -1.0, 1.0).astype(np.float32),
-        reward=found["reward"].astype(np.float32),
-        terminated=found["terminated"].astype(bool),
-        next_obs=found["next_obs"].astype(np.float32),
-    )
+    values: dict[str, Any] = {
+        "obs": found["obs"].astype(np.float32),
+        "action": np.clip(found["action"], -1.0, 1.0).astype(np.float32),
+        "reward": found["reward"].astype(np.float32),
+        "terminated": found["terminated"].astype(bool),
+        "next_obs": found["next_obs"].astype(np.float32),
+    }
+    return Transition(**values)
 
 
 def _find(path: Path, arrays: Mapping[str, np.ndarray], field: str) -> np.ndarray:
