@@ -38,7 +38,7 @@ ALLOWED: dict[str, set[str]] = {
     "worlds": WORLD,
     "droq": {"types", "checks"},
     "replay": {"types", "checks", "files", "array_files"},
-    "policies": ACTING,
+    "policies": ACTING | {"replay"},
     "evaluation": ACTING,
     "training": ACTING | {"evaluation", "replay"},
     "deploy": ACTING | {"evaluation", "figures"},

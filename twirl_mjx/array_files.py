@@ -77,6 +77,20 @@ def read_npz(
             return arrays
 
 
+def names_in_npz(path: str | Path, what: str) -> frozenset[str]:
+    """Return the names of the arrays in a ``.npz`` archive without reading them.
+
+    Raises:
+        FileError: As :func:`read_npz`.
+    """
+    files.check_readable(path, what)
+    with open(path, "rb") as file, _named(path, ".npz archive", what):
+        if file.read(6) == np.lib.format.MAGIC_PREFIX:
+            raise ValueError("it holds one array, not an archive")
+        with zipfile.ZipFile(file) as archive:
+            return frozenset(name.removesuffix(".npy") for name in archive.namelist())
+
+
 def _read_array(file: Any, size: int) -> np.ndarray:
     """Return the array of a stream in numpy's format that has ``size`` bytes.
 

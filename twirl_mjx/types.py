@@ -54,8 +54,9 @@ class SourcePolicy(Protocol):
         ...
 
     def act(self, memory: Any, state: Any, key: jax.Array) -> tuple[jax.Array, Any]:
-        """Return actions [N, A] in [-1, 1] and the next memory.
+        """Return actions [N, A] and the next memory.
 
+        Actions are in [-1, 1]; the worlds clip what is outside, and a recording counts it.
         Worlds that were just auto-reset have ``state.world.episode_step == 0``; their memory must
         be started afresh.
         """

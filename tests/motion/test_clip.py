@@ -13,8 +13,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
+from twirl_mjx.assets import asset_path
 from twirl_mjx.motion.clip import Clip, configurations, frame_velocities, sample, slerp
-from twirl_mjx.motion.formats import foot_paths, read_clip, write_clip
+from twirl_mjx.motion.formats import Conversion, foot_paths, read_clip, write_clip
+from twirl_mjx.motion.plausible import check_plausible
 from twirl_mjx.sim.robots import A1
 
 SAMPLE = jax.jit(jax.vmap(sample, in_axes=(None, 0)))
@@ -251,3 +253,123 @@ def test_wrong_shapes_are_refused() -> None:
         dataclasses.replace(clip, frame_duration=0)
     with pytest.raises(ValueError, match="loop 'once'"):
         dataclasses.replace(clip, loop="once")
+
+
+def leap_file(path: Path, change: Any) -> Path:
+    """Write the shipped leap with its numbers changed: ``change(data, frames [F, 19])``."""
+    write_clip(read_clip(asset_path("a1", "leap.json")), path)
+    data = json.loads(path.read_text())
+    frames = np.array(data["Frames"])
+    change(data, frames)
+    path.write_text(json.dumps(data | {"Frames": frames.tolist()}))
+    return path
+
+
+def _degrees(data: dict, frames: np.ndarray) -> None:
+    frames[:, 7:] = np.rad2deg(frames[:, 7:])
+
+
+def _centimetres(data: dict, frames: np.ndarray) -> None:
+    frames[:, :3] *= 100.0
+
+
+def _wxyz(data: dict, frames: np.ndarray) -> None:
+    frames[:, 3:7] = frames[:, [6, 3, 4, 5]]
+
+
+def _laikago(data: dict, frames: np.ndarray) -> None:
+    upright = Rotation.from_quat([0.5, 0.5, 0.5, 0.5])
+    frames[:, 3:7] = (Rotation.from_quat(frames[:, 3:7]) * upright).as_quat()
+
+
+def _rate(data: dict, frames: np.ndarray) -> None:
+    data["FrameDuration"] = 1.0 / data["FrameDuration"]
+
+
+def _jump(data: dict, frames: np.ndarray) -> None:
+    frames[5:, 11] += 3.0
+
+
+def _spin(data: dict, frames: np.ndarray) -> None:
+    frames[:, 9] += 1.5
+
+
+def _float(data: dict, frames: np.ndarray) -> None:
+    frames[:, 2] += 0.5
+
+
+RATE = 1.0 / read_clip(asset_path("a1", "leap.json")).frame_duration
+
+
+@pytest.mark.parametrize(
+    ("change", "message", "conversion"),
+    [
+        (_degrees, r"frame \d+: joint \w+_calf_joint is -\d+.* rad, limit 6\.28 \(degrees\?",
+         Conversion(degrees=True)),
+        (_centimetres, r"frame \d+: root height is .* m, limit 3 \(centimetres\? --imitate",
+         Conversion(metres=0.01)),
+        (_wxyz, r"frame \d+: the robot lies on its back.*--imitate\.clip-quaternion wxyz",
+         Conversion(quaternion="wxyz")),
+        (_laikago, r"frame \d+: the left flank points up by .*--imitate\.clip-root laikago",
+         Conversion(root="laikago")),
+        (_rate, r"FrameDuration is \d+ s, limit 0\.25 \(frames per second\?", Conversion(fps=RATE)),
+        (_jump, r"frame 5: joint \w+ jumps at .* rad/s, limit 60", None),
+        (_spin, r"frame \d+: joint FR_calf_joint is .* rad, limits -2\.7 to -0\.9", None),
+        (_float, r"frame \d+: the lowest foot of the clip is 0\.\d+ m high, limits", None),
+    ],
+)  # fmt: skip
+def test_implausible_clips_are_caught_and_converted(
+    change: Any, message: str, conversion: Conversion | None, tmp_path: Path
+) -> None:
+    path = leap_file(tmp_path / "mine.json", change)
+    with pytest.raises(ValueError, match=rf"mine: {message}"):
+        check_plausible(read_clip(path))
+    if conversion is not None:
+        back = read_clip(path, conversion=conversion)
+        check_plausible(back)
+        leap = read_clip(asset_path("a1", "leap.json"))
+        np.testing.assert_allclose(back.joint_pos, leap.joint_pos, atol=1e-5)
+        np.testing.assert_allclose(back.root_pos, leap.root_pos, atol=1e-5)
+        np.testing.assert_allclose(np.abs((back.root_quat * leap.root_quat).sum(1)), 1.0, atol=1e-5)
+        assert back.frame_duration == pytest.approx(leap.frame_duration)
+
+
+def test_three_keys_with_a_leg_order_a_mark_and_line_ends(tmp_path: Path) -> None:
+    clip = make_clip()
+    write_clip(clip, tmp_path / "walk.json")
+    data = json.loads((tmp_path / "walk.json").read_text())
+    for frame in data["Frames"]:
+        fr, fl, rr, rl = (frame[i : i + 3] for i in (7, 10, 13, 16))
+        frame[7:] = fl + fr + rl + rr
+    keys = {"FrameDuration": 0.05, "LegOrder": "FL FR RL RR", "Frames": data["Frames"]}
+    path = tmp_path / "three.json"
+    path.write_bytes(b"\xef\xbb\xbf" + json.dumps(keys, indent=1).replace("\n", "\r\n").encode())
+    back = read_clip(path)
+    np.testing.assert_allclose(back.joint_pos, clip.joint_pos, atol=1e-6)
+    assert (back.loop, back.cycle_offset_position) == ("wrap", True)
+    path.write_text(json.dumps(keys | {"LegOrder": ["FL", "FR", "LF", "RR"]}))
+    with pytest.raises(ValueError, match=r"key LegOrder is .*permutation of FR, FL, RR, RL"):
+        read_clip(path)
+
+
+@pytest.mark.parametrize("columns", [12, 19])
+def test_tables_of_joint_trajectories(columns: int, tmp_path: Path) -> None:
+    clip = make_clip()
+    write_clip(clip, tmp_path / "walk.json")
+    rows = np.array(json.loads((tmp_path / "walk.json").read_text())["Frames"])[:, 19 - columns :]
+    np.save(tmp_path / "walk.npy", rows)
+    text = ",".join(f"c{i}" for i in range(columns)) + "\r\n"
+    text += "".join(",".join(map(str, row)) + "\r\n" for row in rows)
+    (tmp_path / "walk.csv").write_text(text)
+    for name in ("walk.npy", "walk.csv"):
+        with pytest.raises(ValueError, match=r"does not say its rate .*--imitate\.clip-fps"):
+            read_clip(tmp_path / name)
+        back = read_clip(tmp_path / name, conversion=Conversion(fps=20.0))
+        np.testing.assert_allclose(back.joint_pos, clip.joint_pos, atol=1e-6)
+        assert back.frame_duration == pytest.approx(0.05)
+        if columns == 12:
+            lowest = foot_paths(back)[..., 2].min(axis=1)
+            np.testing.assert_allclose(lowest, A1.foot_radius, atol=1e-9)
+    (tmp_path / "walk.csv").write_text("1,2\n3,x\n")
+    with pytest.raises(ValueError, match="row 1: could not convert"):
+        read_clip(tmp_path / "walk.csv")

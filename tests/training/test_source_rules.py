@@ -5,11 +5,26 @@ from __future__ import annotations
 import dataclasses
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from twirl_mjx.training import source_rules
+from twirl_mjx.policies.recorded import RecordedPolicy
+from twirl_mjx.policies.resolve import Source, Terms
+from twirl_mjx.replay import dataset
+from twirl_mjx.training import pipeline, source_rules
 from twirl_mjx.training.presets import make_config
-from twirl_mjx.training.source_rules import AtPath, NominalRun, RunOf, Scripted, source_of
+from twirl_mjx.training.rundir import Foreign, New, RunDir, RunMismatchError
+from twirl_mjx.training.source_rules import (
+    AtPath,
+    InFile,
+    NominalRun,
+    RunOf,
+    Scripted,
+    check_source_is_used,
+    source_of,
+    terms_of,
+)
+from twirl_mjx.types import Transition
 
 SHIPPED = Path("a", "policy.npz")
 
@@ -101,3 +116,52 @@ def test_a_source_without_effect_is_refused() -> None:
         ValueError, match=r"source trot would do nothing .*nearest: --variant twirl"
     ):
         source_rules.check_source_is_used(dataclasses.replace(scratch, source="trot"), "cpu")
+
+
+def test_a_function_is_a_source_and_terms_need_one() -> None:
+    config = make_config("biped", "cpu")
+    mine = dataclasses.replace(config, source="mine.py:walk", source_contract="go1_joystick")
+    assert source_of(mine, "cpu") == InFile("mine.py:walk")
+    assert terms_of(mine) == Terms("go1_joystick")
+    check_source_is_used(mine, "cpu")
+    lost = dataclasses.replace(config, source_command="1,0,0")
+    with pytest.raises(ValueError, match="--source-command 1,0,0 would do nothing without a"):
+        check_source_is_used(lost, "cpu")
+
+
+@pytest.mark.parametrize("name", ["source.npz", "policy.npz", "policy_last.npz", "eval.csv"])
+def test_files_that_no_run_wrote_are_left_alone(name: str, tmp_path: Path) -> None:
+    (tmp_path / name).write_bytes(b"mine")
+    found = RunDir(tmp_path).status(make_config("biped", "debug"))
+    assert isinstance(found, Foreign)
+    assert f"holds {name} and no config.json" in str(found.error)
+    (tmp_path / name).rename(tmp_path / "notes.txt")
+    assert RunDir(tmp_path).status(make_config("biped", "debug")) == New()
+
+
+def test_data_that_the_run_did_not_collect_are_not_collected_over(tmp_path: Path) -> None:
+    """Of the right format, beside a config of this very run, for other settings."""
+    config = dataclasses.replace(make_config("biped", "debug"), source="trot")
+    run_dir = RunDir(tmp_path / "mine")
+    run_dir.open(config)
+    zeros = np.zeros((4, 101), np.float32)
+    rows = Transition(zeros, zeros[:, :12], zeros[:, 0], zeros[:, 0] > 0, zeros)
+    header = dataset.DatasetHeader("biped", "none", "me", 4, 101, 12, 0.0, "other", "theirs")
+    dataset.write(run_dir.dataset, header, rows)
+    before = run_dir.dataset.read_bytes()
+    source = pipeline.find_source(config, "debug", tmp_path, print)
+    with pytest.raises(RunMismatchError, match=r"this run did not collect \(run theirs did"):
+        pipeline.source_data(config, run_dir, source, print)
+    assert run_dir.dataset.read_bytes() == before
+
+
+def test_recorded_data_become_the_source_ring(tmp_path: Path) -> None:
+    config = make_config("biped", "debug")
+    zeros = np.zeros((4, 101), np.float32)
+    rows = Transition(zeros, zeros[:, :12], zeros[:, 0] + 7.0, zeros[:, 0] > 0, zeros)
+    data = Source(RecordedPolicy("d.npz"), "d.npz", "abc", data=rows)
+    said: list[str] = []
+    found = pipeline.source_data(config, RunDir(tmp_path / "run"), data, said.append)
+    assert int(found.size) == 4
+    assert "4 recorded transitions" in said[-1]
+    assert not (tmp_path / "run").exists()

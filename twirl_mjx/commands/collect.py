@@ -33,7 +33,9 @@ def main(argv: list[str]) -> int:
         before = _version(path)
         pipeline.source_data(config, run_dir, source, say)
         written = _version(path) != before
-    if written:
+    if source.data is not None:
+        say(f"nothing was collected: {source.origin} is recorded data, and `twirl train` reads it")
+    elif written:
         say(f"done: {path}")
     elif config.shift != "none" and source.run_dir is not None:
         say(
@@ -59,8 +61,8 @@ def check_source(config: TrainConfig, preset: str) -> None:
     nearest = "clip" if isinstance(config.options, ImitateOptions) else "trot"
     raise ValueError(
         f"task {config.task} has no source policy of its own, so --source {config.source} finds"
-        f" nothing to record: name one of {', '.join(SCRIPTED_SOURCES)}, a run directory or a"
-        f" policy file (nearest: --source {nearest})"
+        f" nothing to record: name one of {', '.join(SCRIPTED_SOURCES)}, a run directory, a"
+        f" policy file, data or file.py:function (nearest: --source {nearest})"
     )
 
 

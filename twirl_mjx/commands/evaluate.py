@@ -40,8 +40,8 @@ class EvaluateOptions:
     """
 
     policies: Annotated[tuple[str, ...], tyro.conf.Positional]
-    """Run directories, policy files (.npz, .onnx) or scripted names (trot, bound, zero,
-    random, clip)."""
+    """Run directories, policy files (.npz, .onnx), file.py:function or scripted names (trot, bound,
+    zero, random, clip)."""
     task: str | None = None
     """Task to act in; the one a policy was trained for by default."""
     shifts: tuple[str, ...] = PAPER_SHIFTS
@@ -61,6 +61,12 @@ class EvaluateOptions:
     runs/evaluation-DATE-TIME.csv."""
     figure: Path | None = None
     """Also draw the returns as bars into this PNG file."""
+    source_contract: str = ""
+    """How foreign policies meet the robot, by name or file (docs/sources.md)."""
+    source_command: str = ""
+    """What foreign policies are told to do: 0.5,0,0 or towards-goal:0.5."""
+    allow_clipping: bool = False
+    """Score foreign policies without a contract although their outputs leave [-1, 1]."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -125,8 +131,9 @@ def resolve_all(options: EvaluateOptions, overrides: Overrides) -> list[Candidat
         ValueError: A file that is no policy, options of another task, or two policies that the
             table could not tell apart.
     """
-    from twirl_mjx.policies.resolve import resolve_policy
+    from twirl_mjx.policies.resolve import Terms, resolve_policy
 
+    terms = Terms(options.source_contract, options.source_command, options.allow_clipping)
     candidates: dict[str, Candidate] = {}
     for given in options.policies:
         run = name_of(given)
@@ -138,7 +145,14 @@ def resolve_all(options: EvaluateOptions, overrides: Overrides) -> list[Candidat
         config = with_overrides(config_of(given, options.task), overrides)
         config = dataclasses.replace(config, course=options.course, engine=options.engine)
         config.make_task()  # refuses options that only the task can judge
-        candidates[run] = Candidate(given, run, config, resolve_policy(given, config))
+        found = resolve_policy(given, config, terms=terms)
+        if found.data is not None:
+            raise ValueError(
+                f"{given} is recorded data, which does not act (nearest: the policy behind it)"
+            )
+        for note in found.notes:
+            say(f"{given}: {note}")
+        candidates[run] = Candidate(given, run, config, found)
     return list(candidates.values())
 
 

@@ -13,7 +13,8 @@ import tyro
 
 from twirl_mjx.checks import check_range
 from twirl_mjx.commands.console import say
-from twirl_mjx.policies.learned import BEST_POLICY, LAST_POLICY, load_policy
+from twirl_mjx.plugins import is_reference
+from twirl_mjx.policies.learned import BEST_POLICY, LAST_POLICY
 
 if TYPE_CHECKING:
     from twirl_mjx.evaluation.record import Recording
@@ -30,7 +31,7 @@ class RenderOptions:
     """Film one episode of a policy: an mp4 and a strip of frames, without a display."""
 
     policy: Annotated[str, tyro.conf.Positional]
-    """Run directory, policy file (.npz, .onnx) or scripted name."""
+    """Run directory, policy file (.npz, .onnx), file.py:function or scripted name."""
     task: str | None = None
     """Task to act in; the one the policy was trained for by default."""
     shift: str | None = None
@@ -43,6 +44,12 @@ class RenderOptions:
     """Frames in the strip."""
     out: Path | None = None
     """Path without ending; <run>/episode, or runs/<policy>-<task>, by default."""
+    source_contract: str = ""
+    """How a foreign policy meets the robot, by name or file (docs/sources.md)."""
+    source_command: str = ""
+    """What a foreign policy is told to do: 0.5,0,0 or towards-goal:0.5."""
+    allow_clipping: bool = False
+    """Show a foreign policy without a contract although its outputs leave [-1, 1]."""
 
     def __post_init__(self) -> None:
         """Check the numbers.
@@ -79,10 +86,13 @@ def film(config: WorldConfig, options: RenderOptions, stem: Path) -> Path:
     """Write ``<stem>.mp4`` and ``<stem>.png``; return the strip's path."""
     from twirl_mjx.deploy.render import render_episode
     from twirl_mjx.evaluation.record import record_episode, scene_model
-    from twirl_mjx.policies.resolve import resolve_policy
+    from twirl_mjx.policies.resolve import Terms, resolve_policy
     from twirl_mjx.sim.robots import ROBOTS
 
-    found = resolve_policy(options.policy, config)
+    terms = Terms(options.source_contract, options.source_command, options.allow_clipping)
+    found = resolve_policy(options.policy, config, terms=terms)
+    for note in found.notes:
+        say(f"{options.policy}: {note}")
     control_dt = ROBOTS.get(config.robot).control_dt
     steps = min(config.episode_length, round(options.seconds / control_dt))
     recording = record_episode(config, found.policy, seed=options.seed, steps=steps)
@@ -130,7 +140,7 @@ def config_of(policy: str, task: str | None) -> WorldConfig:
         PolicyFileError: The file is no policy, or of a task or with options unknown here.
         ValueError: The policy does not say its task and none is given.
     """
-    from twirl_mjx.policies.resolve import SCRIPTED_SOURCES, config_of_card
+    from twirl_mjx.policies.resolve import config_of_card, header_of
     from twirl_mjx.tasks.registry import TASKS
     from twirl_mjx.training.rundir import RunDir
     from twirl_mjx.worlds.config import WorldConfig, in_task
@@ -141,7 +151,7 @@ def config_of(policy: str, task: str | None) -> WorldConfig:
         if name in (None, config.task):
             return config
         return in_task(config, name, TASKS.get(name).paper_options())
-    header = None if policy in SCRIPTED_SOURCES else load_policy(policy).header
+    header = header_of(policy)
     if header is not None and name in (None, header.task):
         return config_of_card(header, policy)
     if name is None:
@@ -160,6 +170,9 @@ def name_of(policy: str) -> str:
 
     if policy in SCRIPTED_SOURCES:
         return policy
+    if is_reference(policy):
+        file, _, function = policy.rpartition(":")
+        return f"{Path(file).stem}-{function}"
     path = Path(os.path.abspath(policy))  # ".." and "." have no name
     if path.is_dir():
         return path.name

@@ -9,7 +9,7 @@ rigid motion. Joints are in the order of the robot, quaternions are wxyz, body t
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import flax.struct
 import jax
@@ -20,9 +20,19 @@ from twirl_mjx.sim import frames
 from twirl_mjx.sim.robot import Robot
 from twirl_mjx.sim.robots import A1
 
+if TYPE_CHECKING:
+    from scipy.spatial.transform import Rotation
+
 LoopMode = Literal["wrap", "clamp"]
 QUAT_TOLERANCE = 0.01
 """Largest deviation of a frame's quaternion norm from 1; smaller ones are normalised away."""
+
+
+def rotation_of(quat: np.ndarray) -> Rotation:
+    """Return the rotations of quaternions w x y z, [F, 4] or [4]."""
+    from scipy.spatial.transform import Rotation  # takes long to import
+
+    return Rotation.from_quat(quat, scalar_first=True)
 
 
 class ClipArrays(flax.struct.PyTreeNode):
@@ -187,7 +197,7 @@ def frame_velocities(clip: Clip) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     from scipy.spatial.transform import Rotation  # takes long to import
 
     dt = clip.frame_duration
-    rotation = Rotation.from_quat(clip.root_quat, scalar_first=True)
+    rotation = rotation_of(clip.root_quat)
     slopes = [
         np.diff(clip.root_pos, axis=0) / dt,
         (rotation[:-1].inv() * rotation[1:]).as_rotvec() / dt,
@@ -299,7 +309,7 @@ def configurations(clip: Clip, times: np.ndarray) -> np.ndarray:
     grid = np.linspace(0.0, clip.cycle_duration, clip.num_frames)
     columns = np.concatenate([clip.root_pos, clip.joint_pos], axis=1).T
     values = np.stack([np.interp(inside, grid, column) for column in columns], axis=1)
-    rotation = Slerp(grid, Rotation.from_quat(clip.root_quat, scalar_first=True))(inside)
+    rotation = Slerp(grid, rotation_of(clip.root_quat))(inside)
     x, y, yaw = clip.cycle_displacement
     # In the complex plane a cycle turns by `turn` about the start and then moves by x + iy.
     start, turn = complex(*clip.root_pos[0, :2]), np.exp(1j * yaw)

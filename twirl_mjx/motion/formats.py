@@ -10,12 +10,19 @@ numbers of a frame; quaternions are x y z w in both, joints FR FL RR RL x hip th
   is recomputed on reading and writing. Toes are written in the world frame, as in the A1 files
   this was checked with.
 
-The joint order cannot be told from a file: for another one pass ``legs`` to ``read_clip``. A clip
-has the joints in the order of its robot.
+A file of three keys (``FrameDuration``, ``LegOrder``, ``Frames``) wraps, as ``Clip`` does by
+default. ``.npy`` and ``.csv`` files hold the frames alone: the numbers of ``peng``, or joint angles
+only, for which the robot is put level on its lowest foot.
+
+Without ``LegOrder`` the order of the legs cannot be told: for another one pass ``legs`` to
+``read_clip``; for other units and frames a ``Conversion``. A clip has the joints in the order of
+its robot. Whether a clip can be a motion at all: ``plausible``.
 """
 
 from __future__ import annotations
 
+import csv
+import dataclasses
 import json
 import math
 from collections.abc import Sequence
@@ -24,8 +31,9 @@ from typing import Any, Literal
 
 import numpy as np
 
-from twirl_mjx import files
-from twirl_mjx.motion.clip import Clip, LoopMode, frame_velocities
+from twirl_mjx import array_files, files
+from twirl_mjx.checks import check_choice, check_range
+from twirl_mjx.motion.clip import Clip, LoopMode, frame_velocities, rotation_of
 from twirl_mjx.sim import kinematics
 from twirl_mjx.sim.robot import LEG_SIZE, NUM_LEGS, ROOT_SIZE, Robot
 from twirl_mjx.sim.robots import A1
@@ -39,15 +47,63 @@ FRAME_SIZES: dict[str, int] = {"peng": POSE_SIZE, "amp": POSE_SIZE + 3 * NUM_JOI
 CORNERS = ("FR", "FL", "RR", "RL")
 """Legs of a file in their order: front right, front left, hind right, hind left."""
 LOOP_MODES: dict[str, LoopMode] = {"Wrap": "wrap", "Clamp": "clamp"}
+LAIKAGO = np.full(4, 0.5)
+"""Root of a Laikago that stands upright in files of Peng et al.; ours is the identity then."""
 
 
-def read_clip(path: str | Path, legs: Sequence[str] = CORNERS, robot: Robot = A1) -> Clip:
-    """Read a clip of either layout; the frame size tells which.
+@dataclasses.dataclass(frozen=True)
+class Conversion:
+    """What a file has other than radians, metres, x y z w, a root with z up and its own rate."""
+
+    degrees: bool = False
+    """Joint angles are in degrees."""
+    metres: float = 1.0
+    """m per unit of the root position: 0.01 for centimetres."""
+    quaternion: Literal["xyzw", "wxyz"] = "xyzw"
+    """Order of the numbers of a quaternion."""
+    root: Literal["a1", "laikago"] = "a1"
+    """Frame of the root: x forward and z up, or that of a Laikago."""
+    fps: float = 0.0
+    """Frames per second, instead of ``FrameDuration``; 0 to keep that."""
+
+    def __post_init__(self) -> None:
+        """Check every value, or raise ValueError."""
+        check_range("clip metres", self.metres, 1e-6, 100.0)
+        check_choice("clip quaternion", self.quaternion, ("xyzw", "wxyz"))
+        check_choice("clip root", self.root, ("a1", "laikago"))
+        check_range("clip fps", self.fps, 0.0, 10_000.0)
+
+    def apply(self, frames: np.ndarray) -> np.ndarray:
+        """Return frames [F, 19 or more] in our units and frames."""
+        out = frames.copy()
+        out[:, :3] *= self.metres
+        if self.quaternion == "wxyz":
+            out[:, 3:7] = frames[:, [4, 5, 6, 3]]
+        if self.root == "laikago":
+            turned = rotation_of(out[:, [6, 3, 4, 5]]) * rotation_of(LAIKAGO).inv()
+            out[:, 3:7] = turned.as_quat()
+        if self.degrees:
+            out[:, ROOT_SIZE:POSE_SIZE] = np.deg2rad(frames[:, ROOT_SIZE:POSE_SIZE])
+        return out
+
+
+AS_IS = Conversion()
+
+
+def read_clip(
+    path: str | Path,
+    legs: Sequence[str] = (),
+    robot: Robot = A1,
+    conversion: Conversion = AS_IS,
+) -> Clip:
+    """Read a clip of any layout; ending and frame size tell which.
 
     Args:
         path: The file. Keys other than those of the layout (``MotionWeight``, say) are ignored.
-        legs: Order of the legs in the file, a permutation of FR FL RR RL.
+        legs: Order of the legs in the file, a permutation of FR FL RR RL; by default what the file
+            says, else that.
         robot: Whose motion it is.
+        conversion: What its numbers are.
 
     Returns:
         The motion, named after the file.
@@ -57,19 +113,29 @@ def read_clip(path: str | Path, legs: Sequence[str] = CORNERS, robot: Robot = A1
         ValueError: the file is malformed; the message names the file and the line, key or frame.
     """
     path = Path(path)
+    data = _table(path) if path.suffix in (".npy", ".csv") else _parse(path)
+    legs = legs or _legs(path, data)
     if sorted(legs) != sorted(CORNERS):
         raise ValueError(f"legs {list(legs)} must be a permutation of {', '.join(CORNERS)}")
-    data = _parse(path)
     frames = _frames(path, data)
+    is_bare = frames.shape[1] == NUM_JOINTS
+    if is_bare:
+        root = np.tile([0.0] * 6 + [1.0], (len(frames), 1))
+        frames = np.concatenate([root, frames], axis=1)
+        conversion = Conversion(degrees=conversion.degrees, fps=conversion.fps)
+    frames = conversion.apply(frames)
     angles = frames[:, ROOT_SIZE:POSE_SIZE].reshape(-1, NUM_LEGS, LEG_SIZE)
     joints = np.zeros_like(angles)
     joints[:, list(robot.corners)] = angles[:, [list(legs).index(leg) for leg in CORNERS]]
+    joints = joints.reshape(-1, NUM_JOINTS)
+    if is_bare:
+        frames[:, 2] = _on_its_feet(robot, joints)
     try:
         return Clip(
             root_pos=frames[:, :3],
             root_quat=frames[:, [6, 3, 4, 5]],
-            joint_pos=joints.reshape(-1, NUM_JOINTS),
-            frame_duration=_duration(path, data),
+            joint_pos=joints,
+            frame_duration=_duration(path, data, conversion),
             loop=_loop(path, data),
             cycle_offset_position=_flag(path, data, "EnableCycleOffsetPosition"),
             cycle_offset_rotation=_flag(path, data, "EnableCycleOffsetRotation"),
@@ -87,7 +153,50 @@ def _parse(path: Path) -> dict[str, Any]:
     return data
 
 
+DEFAULTS: dict[str, Any] = {
+    "LoopMode": "Wrap",
+    "EnableCycleOffsetPosition": True,
+    "EnableCycleOffsetRotation": False,
+}
+"""What a file with ``LegOrder``, or one of frames alone, does not say."""
+
+
+def _table(path: Path) -> dict[str, Any]:
+    """Return the frames of a ``.npy`` or ``.csv`` file under the keys of a JSON file."""
+    if path.suffix == ".npy":
+        array = array_files.read_npy(path, "a clip", files.TEXT_LIMIT)
+        if array.ndim != 2 or array.dtype.kind not in "fiu":
+            raise ValueError(
+                f"{path}: an array {array.shape} of {array.dtype}, need [F, N] numbers"
+            )
+        rows = array.astype(np.float64).tolist()
+    else:
+        lines = list(csv.reader(files.read_text(path, "a clip").splitlines()))
+        lines = [line for line in lines if any(cell.strip() for cell in line)]
+        rows = []
+        for number, line in enumerate(lines):
+            try:
+                rows.append([float(cell) for cell in line])
+            except ValueError as error:
+                if number:  # the first line may be a header
+                    raise ValueError(f"{path}: row {number}: {error}") from error
+    return DEFAULTS | {"Frames": rows}
+
+
+def _legs(path: Path, data: dict[str, Any]) -> Sequence[str]:
+    """Return the order of the legs that a file says, or the usual one."""
+    given = data.get("LegOrder", CORNERS)
+    legs = given.replace(",", " ").split() if isinstance(given, str) else given
+    if not isinstance(legs, list | tuple) or sorted(map(str, legs)) != sorted(CORNERS):
+        raise ValueError(
+            f"{path}: key LegOrder is {given!r}, need a permutation of {', '.join(CORNERS)}"
+        )
+    return legs
+
+
 def _value(path: Path, data: dict[str, Any], key: str) -> Any:
+    if key not in data and "LegOrder" in data and key in DEFAULTS:
+        return DEFAULTS[key]
     if key not in data:
         raise ValueError(f"{path}: key {key} is missing (keys present: {', '.join(data)})")
     return data[key]
@@ -100,7 +209,11 @@ def _flag(path: Path, data: dict[str, Any], key: str) -> bool:
     return value
 
 
-def _duration(path: Path, data: dict[str, Any]) -> float:
+def _duration(path: Path, data: dict[str, Any], conversion: Conversion) -> float:
+    if conversion.fps:
+        return 1.0 / conversion.fps
+    if path.suffix in (".npy", ".csv"):
+        raise ValueError(f"{path}: it does not say its rate (nearest: --imitate.clip-fps 50)")
     value = _value(path, data, "FrameDuration")
     if not _is_number(value) or not value > 0:
         raise ValueError(f"{path}: key FrameDuration is {value!r}, need a time in s above 0")
@@ -119,7 +232,7 @@ def _is_number(value: Any) -> bool:
 
 
 def _frames(path: Path, data: dict[str, Any]) -> np.ndarray:
-    """Return the frames [F, 7 + J or 13 + 4 J], every number checked."""
+    """Return the frames [F, 7 + J or 13 + 4 J] as the file has them, every number checked."""
     frames = _value(path, data, "Frames")
     if not isinstance(frames, list) or len(frames) < 2:
         raise ValueError(f"{path}: key Frames must be a list of at least 2 frames")
@@ -127,7 +240,8 @@ def _frames(path: Path, data: dict[str, Any]) -> np.ndarray:
     for index, frame in enumerate(frames):
         if not isinstance(frame, list):
             raise ValueError(f"{path}: frame {index} is no list of numbers")
-        expected = {len(frames[0])} if index else set(FRAME_SIZES.values())
+        alone = {NUM_JOINTS} if path.suffix in (".npy", ".csv") else set()
+        expected = {len(frames[0])} if index else {*FRAME_SIZES.values(), *alone}
         if len(frame) not in expected:
             need = f"{len(frames[0])} as in frame 0" if index else sizes
             raise ValueError(f"{path}: frame {index} has {len(frame)} numbers, need {need}")
@@ -135,6 +249,12 @@ def _frames(path: Path, data: dict[str, Any]) -> np.ndarray:
             if not _is_number(value):
                 raise ValueError(f"{path}: frame {index}, number {column} is {value!r}")
     return np.array(frames, np.float64)
+
+
+def _on_its_feet(robot: Robot, joint_pos: np.ndarray) -> np.ndarray:
+    """Return the root heights [F] m at which the lowest foot of a level robot touches ground."""
+    feet = kinematics.foot_positions(robot, joint_pos)
+    return robot.foot_radius - feet[..., 2].min(axis=1)
 
 
 def write_clip(clip: Clip, path: str | Path, layout: Layout = "peng") -> None:
@@ -175,9 +295,7 @@ def _by_corner(clip: Clip, values: np.ndarray) -> np.ndarray:
 
 def _derived(clip: Clip) -> list[np.ndarray]:
     """Return what the AMP layout adds to a frame, each [F, K]."""
-    from scipy.spatial.transform import Rotation  # takes long to import
-
-    rotation = Rotation.from_quat(clip.root_quat, scalar_first=True)
+    rotation = rotation_of(clip.root_quat)
     root_vel, root_ang_vel, joint_vel = frame_velocities(clip)
     arms = np.einsum("fij,flj->fli", rotation.as_matrix(), foot_arms(clip))
     toes = clip.root_pos[:, None] + arms
@@ -197,7 +315,5 @@ def foot_arms(clip: Clip) -> np.ndarray:
 
 def foot_paths(clip: Clip) -> np.ndarray:
     """Return the foot centres [F, 4, 3] m in the world frame."""
-    from scipy.spatial.transform import Rotation  # takes long to import
-
-    rotation = Rotation.from_quat(clip.root_quat, scalar_first=True).as_matrix()
+    rotation = rotation_of(clip.root_quat).as_matrix()
     return clip.root_pos[:, None] + np.einsum("fij,flj->fli", rotation, foot_arms(clip))

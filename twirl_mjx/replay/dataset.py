@@ -42,6 +42,8 @@ class DatasetHeader:
     """Mean return of the episodes that ended while collecting; NaN if none did."""
     digest: str = ""
     """Digest of what decides the data: policy, task options, shift, seed, size."""
+    run: str = ""
+    """Name of the run that wrote the file, which alone may replace it."""
     format: str = FORMAT
     version: int = VERSION
 

@@ -14,7 +14,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Literal
 
-from twirl_mjx import files
+from twirl_mjx import files, plugins
 from twirl_mjx.sweep.grid import Draft, Grid, configure
 from twirl_mjx.training import config_json, rundir, source_rules
 from twirl_mjx.training.config import TrainConfig
@@ -125,6 +125,9 @@ def _source_of(
     match source_rules.source_of(config, draft.preset):
         case source_rules.Scripted(name):
             return name, name, ()
+        case source_rules.InFile(reference):
+            file, name = plugins.split(reference, "policy")
+            return f"{_identity_of_path(file)} {name}", f"{file}:{name}", ()
         case source_rules.AtPath(path, is_shipped):
             return _identity_of_path(path), "auto" if is_shipped else str(path.resolve()), ()
         case source_rules.NominalRun() if path := given.get(config.task):

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
-from typing import cast
+from typing import Literal, cast
 
 import flax.struct
 import jax
@@ -25,7 +25,8 @@ import numpy as np
 from twirl_mjx.assets import asset_path
 from twirl_mjx.checks import check_range
 from twirl_mjx.motion.clip import Clip, headings, sample
-from twirl_mjx.motion.formats import foot_paths, read_clip
+from twirl_mjx.motion.formats import AS_IS, Conversion, foot_paths, read_clip
+from twirl_mjx.motion.plausible import check_plausible
 from twirl_mjx.sim import frames, kinematics
 from twirl_mjx.sim.dynamics import Dynamics
 from twirl_mjx.sim.robot import CONTROL_DT, HIP, ROOT_SIZE, THIGH, TRUNK, Robot
@@ -70,23 +71,33 @@ def make_layout(robot: Robot) -> tuple[Entry, ...]:
     )
 
 
-def load_clip(name: str, robot: Robot = A1) -> Clip:
+def load_clip(
+    name: str,
+    robot: Robot = A1,
+    legs: tuple[str, ...] = (),
+    conversion: Conversion = AS_IS,
+) -> Clip:
     """Return the clip of a config, turned to face +x on average.
 
     Args:
         name: ``leap`` for the shipped clip, else the path of a clip file.
         robot: Whose motion it is.
+        legs: Order of the legs in the file, by default what it says.
+        conversion: Units and frames of the file.
 
     Raises:
         FileNotFoundError: There is no such file.
-        ValueError: The file is no clip, its motion ends, or the shipped clip is another robot's.
+        ValueError: The file is no clip, it cannot be a motion of this robot
+            (``plausible``), its motion ends, or the shipped clip is another robot's.
     """
     if name == "leap" and robot is not A1:
         raise ValueError(
             f"imitate.clip 'leap' is a motion of robot {A1.name!r}, not of {robot.name!r}"
             " (nearest: the path of a clip file of its own)"
         )
-    clip = read_clip(asset_path(robot.name, "leap.json") if name == "leap" else name, robot=robot)
+    path = asset_path(robot.name, "leap.json") if name == "leap" else name
+    clip = read_clip(path, legs, robot, conversion)
+    check_plausible(clip)
     if clip.loop != "wrap":
         raise ValueError(
             f"imitate.clip {name!r} has loop mode {clip.loop!r}, which ends after one cycle;"
@@ -253,7 +264,19 @@ class ImitateOptions:
     """Task ``imitate``: track a leap clip."""
 
     clip: str = "leap"
-    """``leap`` (ours) or the path of a clip file."""
+    """``leap`` (ours) or the path of a clip file (.json, .txt, .npy, .csv)."""
+    clip_legs: tuple[str, ...] = ()
+    """Order of the legs in the file, FL FR RL RR say; what the file says, else FR FL RR RL."""
+    clip_degrees: bool = False
+    """The joint angles of the clip are in degrees."""
+    clip_metres: float = 1.0
+    """m per unit of the clip's root position: 0.01 for centimetres."""
+    clip_quaternion: Literal["xyzw", "wxyz"] = "xyzw"
+    """Order of the clip's quaternions."""
+    clip_root: Literal["a1", "laikago"] = "a1"
+    """Root frame of the clip: x forward and z up, or that of a Laikago."""
+    clip_fps: float = 0.0
+    """Frames per second of the clip, instead of what the file says; 0 to keep that."""
     standing_fraction: float = 0.0
     """Share of episodes started at rest on four feet, as the episodes of ``hurdles`` are."""
     max_root_error: float = 1.0
@@ -266,6 +289,18 @@ class ImitateOptions:
         check_range("imitate.standing_fraction", self.standing_fraction, 0.0, 1.0)
         check_range("imitate.max_root_error", self.max_root_error, 1e-3, 1e3)
         check_range("imitate.max_root_angle", self.max_root_angle, 1e-3, 3.1416)
+        _ = self.conversion  # checks itself
+
+    @property
+    def conversion(self) -> Conversion:
+        """What the numbers of the clip are."""
+        return Conversion(
+            self.clip_degrees, self.clip_metres, self.clip_quaternion, self.clip_root, self.clip_fps
+        )
+
+    def load_clip(self, robot: Robot) -> Clip:
+        """Return the clip these options name; errors of :func:`load_clip`."""
+        return load_clip(self.clip, robot, self.clip_legs, self.conversion)
 
 
 @register
@@ -297,7 +332,7 @@ class Imitate(Task[ImitateOptions]):
             FileNotFoundError: The clip of the options does not exist.
             ValueError: It is not a clip, or does not wrap.
         """
-        return ImitateObserver(load_clip(self.options.clip, self.robot))
+        return ImitateObserver(self.options.load_clip(self.robot))
 
     @property
     def follower(self) -> ImitateObserver:

@@ -56,7 +56,16 @@ class TrainConfig(WorldConfig):
     variant: Variant = "twirl"
     """scratch, twirl, twirl+weights, weights or zero-shot."""
     source: str = "auto"
-    """auto (shipped policy, else train it), train, trot, bound, zero, random, clip, or a file."""
+    """auto (shipped policy, else train it), train, trot, bound, zero, random, clip, a run, a policy
+    file (.npz, .onnx), recorded data (.npz) or file.py:function of your own."""
+    source_contract: str = ""
+    """How a foreign source meets the robot: go1_joystick, legged_gym_48, legged_gym_45, ... or a
+    JSON file (docs/sources.md); by default what the file itself says."""
+    source_command: str = ""
+    """What a foreign source is told to do: 0.5,0,0 (m/s forward, m/s left, rad/s yaw) or
+    towards-goal:0.5; by default the constants of its contract."""
+    allow_clipping: bool = False
+    """Record a source although more than 20 % of its joint targets lie outside the action box."""
     source_options: Any = None
     """Options of the task whose policy is the default source; None where there is none."""
     seed: int = 0

@@ -20,6 +20,8 @@ import jax.numpy as jnp
 from twirl_mjx import exits, records
 from twirl_mjx.checks import choose_one
 from twirl_mjx.droq.state import DroqState
+from twirl_mjx.policies import recorded
+from twirl_mjx.policies.foreign import MAX_CLIPPED
 from twirl_mjx.policies.resolve import SCRIPTED_SOURCES, Source, resolve_policy
 from twirl_mjx.replay import dataset, ring
 from twirl_mjx.training import loop, rundir, source_rules
@@ -125,6 +127,8 @@ def _outlived_its_source(config: TrainConfig, preset: str, runs_dir: Path, run_d
             return False
         case source_rules.AtPath(path):
             return not path.exists()
+        case source_rules.InFile(reference):
+            return not Path(reference.rpartition(":")[0]).expanduser().exists()
         case source_rules.RunOf(first):
             return not (runs_dir / rundir.default_name(first, preset)).exists()
         case source_rules.NominalRun():
@@ -172,17 +176,22 @@ def find_source(
     noise = config.uses_source_data and config.replay.source_noise
 
     def at(path: Path) -> Source:
-        return resolve_policy(str(path), config.evaluation, noise=noise)
+        terms = source_rules.terms_of(config)
+        return resolve_policy(str(path), config.evaluation, noise=noise, terms=terms)
 
     match source_rules.source_of(config, preset):
         case source_rules.NominalRun():
             return at(_nominal_run(config, preset, runs_dir).path)
         case source_rules.Scripted(name):
-            return resolve_policy(name, config)
+            return resolve_policy(name, config, terms=source_rules.terms_of(config))
+        case source_rules.InFile(reference):
+            terms = source_rules.terms_of(config)
+            return resolve_policy(reference, config.evaluation, terms=terms)
         case source_rules.AtPath(path, is_shipped):
             if is_shipped:
                 shown = f"assets/policies/{path.name}"
                 say(f"source: the shipped policy {shown} (--source train trains your own)")
+            recorded.refuse_format(str(path))
             if not path.exists():
                 raise FileNotFoundError(no_such_source(path, runs_dir))
             return at(path)
@@ -224,6 +233,11 @@ def source_data(config: TrainConfig, run_dir: RunDir, source: Source, say: Say) 
 
     Collected data are kept in ``run_dir/source.npz`` and used again while they fit.
     """
+    for note in source.notes:
+        say(f"source {source.origin}: {note}")
+    if source.data is not None:
+        say(f"source data: {source.origin}, {len(source.data.reward):,} recorded transitions")
+        return ring.from_transitions(recorded.as_device(source.data))
     env = make_env(config.evaluation)
     if config.shift != "none" and source.run_dir is not None:
         nominal = RunDir(source.run_dir).read_config()
@@ -245,6 +259,12 @@ def source_data(config: TrainConfig, run_dir: RunDir, source: Source, say: Say) 
         if header.digest == digest:
             say(f"source data: {path}, {header.size:,} transitions of {header.source}")
             return ring.from_transitions(jax.tree.map(jnp.asarray, data))
+        if header.run != run_dir.name:
+            raise rundir.RunMismatchError(
+                f"{path} holds {header.size:,} transitions of {header.source} that this run did not"
+                f" collect{f' (run {header.run} did)' if header.run else ''}; nothing was touched"
+                " (nearest: another --name, or move the file and name it with --source)"
+            )
         say(f"{path} was collected for other settings: collecting again")
     say(f"stage 2 of 3: collecting {size:,} transitions of {source.origin} in {config.task}")
     data = write_dataset(config, source, path, digest, say)
@@ -277,7 +297,10 @@ def write_dataset(config: TrainConfig, source: Source, path: Path, digest: str, 
     size = config.replay.source_size
     env = make_env(config.evaluation, num_envs=_collecting_worlds(config))
     key = jax.random.fold_in(jax.random.key(config.seed), 0x50)
-    data, means = collect(env, source.policy, key, size)
+    limit = 1.0 if config.allow_clipping else MAX_CLIPPED
+    data, means = collect(env, source.policy, key, size, max_clipped=limit)
+    if clipped := means.pop("clipped", 0.0):
+        say(f"{clipped:.1%} of the source's joint targets lay outside the action box: clipped")
     say("source policy in the target task: " + describe(means))
     header = dataset.DatasetHeader(
         task=config.task,
@@ -288,6 +311,7 @@ def write_dataset(config: TrainConfig, source: Source, path: Path, digest: str, 
         action_size=env.action_size,
         mean_return=means.get("return", float("nan")),
         digest=digest,
+        run=path.parent.name,
     )
     dataset.write(path, header, data)
     return data

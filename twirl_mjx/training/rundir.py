@@ -32,9 +32,12 @@ PACKAGES = (
     "twirl-mjx", "mujoco", "mujoco-mjx", "jax", "jaxlib", "brax", "flax", "optax",
     "orbax-checkpoint", "numpy",
 )  # fmt: skip
-MAY_CHANGE = ("total_env_steps:", "checkpoint_minutes:", "eval.", "engine:", "source:", "uses:")
+MAY_CHANGE = (
+    "total_env_steps:", "checkpoint_minutes:", "eval.", "engine:", "source:", "uses:",
+    "source_contract:", "source_command:", "allow_clipping:",
+)  # fmt: skip
 """How the lines of a difference begin that a resumed run may have: they do not alter what was done
-so far. (``source`` is judged by its digest.)"""
+so far. (``source`` and its terms are judged by its digest.)"""
 MOST_WORDS = 3
 """Settings that the default name of a run spells out; more are a digest."""
 EVAL_COLUMNS = (
@@ -182,7 +185,8 @@ class RunDir:
             names = ", ".join(path.name for path in work)
             return Foreign(RunMismatchError(
                 f"{self} holds {names} of a run and no {self.config.name}, so whose they are is"
-                " unknown; nothing was touched. Put that file back, or give another --name."
+                " unknown; nothing was touched. Put that file back, or give another --name;"
+                f" recorded data can be the source of a run: --source {self.dataset}"
             ))  # fmt: skip
         if lines := self._differences(config, source):
             shown = "\n  ".join(lines)

@@ -9,7 +9,8 @@ import dataclasses
 from pathlib import Path
 
 from twirl_mjx.assets import asset_path
-from twirl_mjx.policies.resolve import SCRIPTED_SOURCES
+from twirl_mjx.plugins import is_reference
+from twirl_mjx.policies.resolve import SCRIPTED_SOURCES, Terms
 from twirl_mjx.training.config import TrainConfig
 from twirl_mjx.training.presets import make_config, source_task_of, starts_from_nominal_run
 
@@ -27,8 +28,16 @@ class Scripted:
 
 
 @dataclasses.dataclass(frozen=True)
+class InFile:
+    """A function or policy object in a user's file."""
+
+    reference: str
+    """``file.py:name``."""
+
+
+@dataclasses.dataclass(frozen=True)
 class AtPath:
-    """A policy file or a run directory that exists, or should."""
+    """A policy file, recorded data or a run directory that exists, or should."""
 
     path: Path
     is_shipped: bool = False
@@ -74,8 +83,15 @@ def check_source_is_used(config: TrainConfig, preset: str) -> None:
     """Refuse a source that would have no effect.
 
     Raises:
-        ValueError: The variant is ``scratch`` and a source is named that the preset does not name.
+        ValueError: The variant is ``scratch`` and a source is named that the preset does not name,
+            or there is a contract or a command and no source that could have one.
     """
+    for option, value in (("contract", config.source_contract), ("command", config.source_command)):
+        if value and (config.variant == "scratch" or config.source in ("auto", "train")):
+            raise ValueError(
+                f"--source-{option} {value} would do nothing without a foreign source (nearest:"
+                " --source FILE.onnx, or file.py:function)"
+            )
     if config.variant == "scratch" and config.source not in (
         "auto",
         make_config(config.task, preset).source,
@@ -86,7 +102,12 @@ def check_source_is_used(config: TrainConfig, preset: str) -> None:
         )
 
 
-def source_of(config: TrainConfig, preset: str) -> NominalRun | Scripted | AtPath | RunOf:
+def terms_of(config: TrainConfig) -> Terms:
+    """Return how a foreign source is to be used."""
+    return Terms(config.source_contract, config.source_command, config.allow_clipping)
+
+
+def source_of(config: TrainConfig, preset: str) -> NominalRun | Scripted | InFile | AtPath | RunOf:
     """Return the source of a run that has one.
 
     ``config.source`` is ``auto`` (the shipped policy, else a run of the source task), ``train``
@@ -101,6 +122,8 @@ def source_of(config: TrainConfig, preset: str) -> NominalRun | Scripted | AtPat
         return NominalRun()
     if config.source in SCRIPTED_SOURCES:
         return Scripted(config.source)
+    if is_reference(config.source):
+        return InFile(config.source)
     if config.source not in ("auto", "train"):
         return AtPath(Path(config.source))
     task = source_task_of(config)
