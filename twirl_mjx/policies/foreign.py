@@ -88,7 +88,7 @@ def check_outputs(origin: str, policy: OnnxPolicy, config: WorldConfig) -> None:
     qvel = jnp.zeros(robot.nq - 1)
     start = np.asarray(observer.observe(observer.init(qpos, qvel), qpos[:2] + 1.0, qpos, qvel))
     noise = 0.1 * np.random.default_rng(0).standard_normal((PROBES, len(start)))
-    rows = np.float32(start + noise)
+    rows = np.asarray(start + noise, np.float32)
     memory = [np.repeat(m[None], PROBES, axis=0) for m in policy.initial_memory]
     if policy.batch_size not in (None, 1):
         rows = rows[: policy.batch_size]

@@ -179,8 +179,8 @@ def brain_of_function(item: Any, size: int, origin: str) -> Brain:
     Raises:
         ValueError: Something else, or a function that fails or returns another shape.
     """
-    pair = isinstance(item, tuple | list) and len(item) == 2 and all(map(callable, item))
-    if not pair and not callable(item):
+    pair = _is_pair(item)
+    if not (pair or _is_callable(item)):
         raise ValueError(
             f"{origin} is {type(item).__name__}: need function(obs) -> action, a pair (init, step),"
             " or a policy object with init(state) and act(memory, state, key)"
@@ -190,7 +190,7 @@ def brain_of_function(item: Any, size: int, origin: str) -> Brain:
     except Exception as error:  # whatever a user's function may raise
         raise ValueError(f"{origin}: init() failed: {_line(error)}") from error
     step = item[1] if pair else item
-    given = (jax.ShapeDtypeStruct((2, size), jnp.float32),)
+    given: tuple[Any, ...] = (jax.ShapeDtypeStruct((2, size), jnp.float32),)
     if pair:
         given += (
             jax.tree.map(
@@ -226,6 +226,14 @@ def brain_of_function(item: Any, size: int, origin: str) -> Brain:
         return jnp.asarray(action, jnp.float32), following
 
     return Brain(run, initial, size)
+
+
+def _is_pair(item: Any) -> bool:
+    return isinstance(item, tuple | list) and len(item) == 2 and all(map(callable, item))
+
+
+def _is_callable(item: Any) -> bool:
+    return callable(item)
 
 
 def _line(error: BaseException) -> str:
