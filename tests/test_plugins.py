@@ -24,14 +24,14 @@ def test_an_object_is_loaded_once(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("reference", "message"),
     [
-        ("mine", "'mine' is no reference to an object: expected FILE.py:NAME"),
+        ("mine", "'mine' does not say which object: expected FILE.py:NAME"),
         ("mine.py:", "expected FILE.py:NAME"),
         ("mine.txt:Name", "expected FILE.py:NAME"),
         ("{folder}/none.py:Name", "there is no file .*none.py"),
         ("{folder}/broken.py:Name", r"broken.py does not import: ZeroDivisionError: division"),
         ("{folder}/syntax.py:Name", r"syntax.py does not import: SyntaxError: .*line 2"),
         ("{folder}/exits.py:Name", "exits.py does not import: SystemExit: 3"),
-        ("{folder}/good.py:Nam", r"unknown object in good.py 'Nam': .*\(nearest: 'Name'\)"),
+        ("{folder}/good.py:Nam", r"good.py has no object 'Nam' \(nearest: 'Name'\)"),
     ],
 )
 def test_what_cannot_be_loaded_is_one_line(reference: str, message: str, tmp_path: Path) -> None:

@@ -14,6 +14,7 @@ from __future__ import annotations
 import contextlib
 import csv
 import errno
+import hashlib
 import io
 import json
 import os
@@ -213,6 +214,12 @@ def read_bytes(path: str | Path, what: str, limit: int = SIZE_LIMIT, remedy: str
     if len(content) > limit:
         raise FileError(f"{path} is larger than {limit:,} bytes, expected {what}{then(remedy)}")
     return content
+
+
+def checksum(path: str | Path) -> str:
+    """Return the SHA-256 of a file's content, as 64 hexadecimal digits."""
+    with open(path, "rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def read_tail(path: str | Path, what: str, size: int) -> bytes:

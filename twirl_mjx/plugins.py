@@ -32,8 +32,12 @@ def split(reference: str, kind: str = "object") -> tuple[Path, str]:
         ValueError: No name is given, or there is no such file.
     """
     path_text, _, name = reference.rpartition(":")
-    if not path_text:
-        raise ValueError(f"{reference} does not say which {kind} (nearest: {reference}:Name)")
+    if not path_text.endswith(".py") or not name:
+        file = (path_text or reference).removesuffix(".py") + ".py"
+        raise ValueError(
+            f"{reference!r} does not say which {kind}: expected FILE.py:NAME"
+            f" (nearest: {file}:{name if path_text and name else 'Name'})"
+        )
     path = Path(path_text).expanduser().resolve()
     if not path.is_file():
         beside = [p.name for p in path.parent.glob("*.py")] if path.parent.is_dir() else []
@@ -74,7 +78,7 @@ def _module(path: Path) -> ModuleType:
     sys.path.insert(0, str(path.parent))  # what lies beside the file can be imported
     try:
         spec.loader.exec_module(module)
-    except Exception as error:  # whatever a user's file may raise
+    except (Exception, SystemExit) as error:  # whatever a user's file may raise
         del sys.modules[name]
         what = " ".join(str(error).split())
         raise ValueError(f"{path} does not import: {type(error).__name__}: {what}") from error

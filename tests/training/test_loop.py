@@ -166,13 +166,10 @@ def test_leftovers_of_a_killed_save_are_swept(whole_run: Path, tmp_path: Path) -
     step = tmp_path / "checkpoints" / "orbax" / "128.orbax-checkpoint-tmp"
     (step / "policy.orbax-checkpoint-tmp").mkdir(parents=True)
     (step / "policy.orbax-checkpoint-tmp" / "data").write_text("half")
-    rows = tmp_path / "checkpoints" / "replay" / "rows_000000000096_000000000128.partial"
-    rows.write_text("half")
     checkpoints = Checkpoints(tmp_path)
     assert checkpoints.latest() == 96
     checkpoints.close()
     assert not step.exists()
-    assert not rows.exists()
 
 
 def test_a_finished_run_without_checkpoints_is_not_trained_anew(

@@ -13,7 +13,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from twirl_mjx import plugins, records
+from twirl_mjx import files, plugins, records
 from twirl_mjx.checks import check_choice
 from twirl_mjx.droq.learner import LEARNER
 from twirl_mjx.policies import foreign, onnx_file, recorded, scripted
@@ -159,7 +159,7 @@ def _graph(
     if contract is not None and contract.memory and not given:
         loaded = onnx_file.load_onnx(path, contract.memory)
     brain = foreign.brain_of_graph(loaded)
-    digest = hashlib.sha256(path.read_bytes()).hexdigest()[:12]
+    digest = files.checksum(path)[:12]
     if contract is None:
         _refuse_terms(terms, f"{path} has no contract (nearest: --source-contract too)")
         foreign.check_size(str(path), brain, config)
@@ -183,7 +183,7 @@ def _function(reference: str, config: WorldConfig, terms: Terms) -> Source:
     """Return the source in a user's file: a function, a pair of them, or a policy object."""
     item = plugins.load(reference, "policy")
     path, _ = plugins.split(reference, "policy")
-    digest = hashlib.sha256(path.read_bytes()).hexdigest()[:12]
+    digest = files.checksum(path)[:12]
     item = item() if isinstance(item, type) else item
     if hasattr(item, "init") and hasattr(item, "act"):
         _refuse_terms(terms, f"{reference} sees the whole state of the worlds")
@@ -229,7 +229,7 @@ def header_of(name: str) -> PolicyHeader | None:
 def _digest(path: Path, header: PolicyHeader | None) -> str:
     if path.is_dir() and header is not None:
         return f"{header.config_digest}@{header.card.get('env_steps')}"
-    return hashlib.sha256(path.read_bytes()).hexdigest()[:12]
+    return files.checksum(path)[:12]
 
 
 def config_of_source(

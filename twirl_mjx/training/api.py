@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import dataclasses
 import functools
 from collections.abc import Callable, Mapping, Sequence
@@ -11,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from twirl_mjx import files
 from twirl_mjx.cache import use_cache
 from twirl_mjx.policies.learned import load_policy
 from twirl_mjx.policies.resolve import Source
@@ -45,12 +45,11 @@ class RunResult:
     def curves(self) -> dict[str, tuple[np.ndarray, np.ndarray]]:
         """Metric -> (transitions [n], values [n]) over the run."""
         found: dict[str, list[tuple[float, float]]] = {}
-        with RunDir(self.directory).metrics.open(newline="") as file:
-            for row in csv.DictReader(file):
-                point = (float(row["env_steps"]), float(row["value"]))
-                found.setdefault(row["metric"], []).append(point)
-        columns = {name: np.array(points).T for name, points in found.items()}
-        return {name: (steps, values) for name, (steps, values) in columns.items()}
+        columns = {"metric": str, "env_steps": float, "value": float}
+        for row in files.read_rows(RunDir(self.directory).metrics, "a metrics table", columns):
+            found.setdefault(row["metric"], []).append((row["env_steps"], row["value"]))
+        curves = {name: np.array(points).T for name, points in found.items()}
+        return {name: (steps, values) for name, (steps, values) in curves.items()}
 
 
 def train(

@@ -104,8 +104,6 @@ class Checkpoints:
             *(manifests.folder_of(self._root, step) for step in cut_short),
         ):
             shutil.rmtree(folder)
-        for file in self._replay.glob("*.partial"):
-            file.unlink()
         self._manager = ocp.CheckpointManager(
             self._root / "orbax",
             item_names=("policy", "train_state", "progress"),

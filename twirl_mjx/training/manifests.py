@@ -76,7 +76,7 @@ def seal(root: Path, step: int, inserted: int, rows: Iterable[Path]) -> None:
     sums = {}
     for path in (*state, *rows):
         name = path.relative_to(root).as_posix()
-        sums[name] = known.get(name) or _sum(path)
+        sums[name] = known.get(name) or files.checksum(path)
     record = {"inserted": inserted, "files": sums}
     files.write_json(path_of(root, step), record | {"own": _own_sum(record)})
 
@@ -102,7 +102,7 @@ def check(root: Path, step: int) -> None:
         path = root / name
         if not path.is_file():
             raise DamagedError(f"{path} is missing")
-        if _sum(path) != expected:
+        if files.checksum(path) != expected:
             raise DamagedError(f"{path} is damaged: its checksum is not that of what was saved")
 
 
@@ -157,8 +157,3 @@ def _sums_of_the_one_before(root: Path, step: int) -> dict[str, str]:
                 continue
             known |= {name: value for name, value in sums.items() if name.startswith("replay/")}
     return known
-
-
-def _sum(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()

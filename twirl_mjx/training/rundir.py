@@ -259,7 +259,7 @@ class RunDir:
             if episodes != list(range(count)):
                 return f"{len(episodes)} rows of {name}, expected one for each of {count} episodes"
         known = self._sums().get(str(at))  # versions before 0.2 have written none
-        if known not in (None, _sum(self.episodes.read_bytes())):
+        if known not in (None, files.checksum(self.episodes)):
             return "its checksum is not that of what was written"
         return None
 
@@ -327,7 +327,9 @@ class RunDir:
             for episode in np.flatnonzero(~np.isnan(column))
         ]
         table = files.csv_text([EVAL_COLUMNS, *rows])
-        files.write_json(self.sums, self._sums() | {str(env_steps): _sum(table.encode())})
+        files.write_json(
+            self.sums, self._sums() | {str(env_steps): hashlib.sha256(table.encode()).hexdigest()}
+        )
         files.write_text(self.episodes, table)
 
     @contextlib.contextmanager
@@ -370,15 +372,7 @@ class RunDir:
 
 def _is_header_only(path: Path) -> bool:
     """Return whether a table has no row."""
-    if not path.is_file():
-        return False
-    with path.open("rb") as file:
-        file.readline(files.MB)
-        return not file.readline(files.MB)
-
-
-def _sum(content: bytes) -> str:
-    return hashlib.sha256(content).hexdigest()
+    return path.is_file() and len(files.read_text(path, "a metrics table").splitlines()) < 2
 
 
 def check_name(name: str) -> str:
