@@ -136,7 +136,8 @@ def apply_dynamics(scene: Scene, command: MotorCommand, dynamics: Dynamics) -> m
             whole = changes.get(place.field, field(scene.mjx_model))
             entry = whole.at[index].set(entry)
         changes[place.field] = entry
-    return scene.mjx_model.tree_replace(changes)
+    model: Any = scene.mjx_model.tree_replace(changes)
+    return model
 
 
 def write_physics(

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import flax.struct
 import jax
+import jax.core
 import jax.numpy as jnp
 import mujoco
 import numpy as np
