@@ -37,7 +37,8 @@ def make_info(run_dir: Path, resume: int | None = None) -> RunInfo:
 def open_logger(
     run_dir: Path, resume: int | None = None, sinks: tuple[Sink, ...] = ()
 ) -> RunLogger:
-    return RunLogger(make_info(run_dir, resume), sinks, console=Console(file=io.StringIO()))
+    info = make_info(run_dir, resume)
+    return RunLogger([info], [sinks], console=Console(file=io.StringIO()))
 
 
 def read_events(run_dir: Path) -> list[Event]:
@@ -172,7 +173,7 @@ def test_what_is_no_sink_is_refused_before_anything_starts(
     config = make_config("stand", "debug")
     chosen = (name.format(file=own_file),)
     with pytest.raises(ValueError, match=message) as refusal:
-        pipeline.run(config, "debug", tmp_path / "runs", None, print, chosen)
+        pipeline.run(config, "debug", tmp_path / "runs", None, print, sinks=chosen)
     assert "\n" not in str(refusal.value)
     assert not (tmp_path / "runs").exists()
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from twirl_mjx.commands.console import say
-from twirl_mjx.commands.options import parse_train
+from twirl_mjx.commands.options import parse_collect
 from twirl_mjx.policies.resolve import SCRIPTED_SOURCES
 from twirl_mjx.tasks.imitate import ImitateOptions
 from twirl_mjx.training import pipeline, rundir
@@ -16,7 +16,7 @@ from twirl_mjx.training.sinks.registry import resolve
 
 def main(argv: list[str]) -> int:
     """Record a source policy in a target task as ``runs/<name>/source.npz``."""
-    options = parse_train(argv, "twirl collect")
+    options = parse_collect(argv)
     config = options.config
     check_source(config, options.preset)
     sinks = resolve(options.log)

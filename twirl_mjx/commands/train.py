@@ -10,8 +10,16 @@ from twirl_mjx.training import pipeline
 def main(argv: list[str]) -> int:
     """Train to the budget; see ``training.pipeline``."""
     options = parse_train(argv)
-    run_dir = pipeline.run(
-        options.config, options.preset, options.runs, options.name, say, options.log
+    run_dirs = pipeline.run_seeds(
+        options.config,
+        options.seeds or None,
+        options.preset,
+        options.runs,
+        options.name,
+        say,
+        sinks=options.log,
+        deadline=pipeline.deadline_after(options.minutes),
     )
-    say(f"done: {run_dir} (policy.npz, metrics.csv, eval.csv); film it: twirl render {run_dir}")
+    shown = " ".join(map(str, run_dirs))
+    say(f"done: {shown} (policy.npz, metrics.csv, eval.csv); film it: twirl render {run_dirs[0]}")
     return 0

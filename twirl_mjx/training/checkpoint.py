@@ -103,6 +103,11 @@ class Checkpoints:
         """Return the env steps of the newest checkpoint, None without one."""
         return self._manager.latest_step()
 
+    def back_to(self, step: int) -> None:
+        """Delete the checkpoints after ``step``, which is one of them."""
+        for later in [kept for kept in self._manager.all_steps() if kept > step]:
+            self._manager.delete(later)
+
     def save(self, state: TrainState, progress: dict[str, Any]) -> None:
         """Write a checkpoint; a second save at the same env steps does nothing.
 
@@ -255,14 +260,20 @@ def _open(run_dir: Path) -> tuple[ocp.CheckpointManager, int]:
     return manager, step
 
 
-def has_checkpoint(run_dir: Path) -> bool:
-    """Return whether a run can be resumed; nothing is created."""
+def stored_steps(run_dir: Path) -> list[int]:
+    """Return the env steps of the checkpoints of a run, oldest first; nothing is created."""
     try:
         manager, _ = _open(run_dir)
     except FileNotFoundError:
-        return False
+        return []
+    steps = sorted(manager.all_steps())
     manager.close()
-    return True
+    return steps
+
+
+def has_checkpoint(run_dir: Path) -> bool:
+    """Return whether a run can be resumed; nothing is created."""
+    return bool(stored_steps(run_dir))
 
 
 def load_learner(run_dir: Path) -> dict[str, Any]:
