@@ -23,6 +23,7 @@ from twirl_mjx.replay import ring
 from twirl_mjx.training import config_json, learners, loop, state, weights
 from twirl_mjx.training.config import TrainConfig
 from twirl_mjx.training.presets import make_config
+from twirl_mjx.training.run import Part
 from twirl_mjx.training.rundir import RunDir
 from twirl_mjx.types import Learner, MetricInfo, Transition
 from twirl_mjx.worlds.make import make_env
@@ -112,7 +113,8 @@ def constant_source(size: int, action: float) -> ring.RingBuffer:
 def test_a_learner_of_its_own_trains_a_run_to_its_end(
     clone: Learner, clone_config: TrainConfig, tmp_path: Path
 ) -> None:
-    outcome = loop.train(clone_config, RunDir(tmp_path / "run"), source=constant_source(200, 0.5))
+    source = constant_source(200, 0.5)
+    (outcome,) = loop.train([Part(clone_config, RunDir(tmp_path / "run"), source)])
     assert outcome.finished
     with (tmp_path / "run" / "metrics.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))

@@ -54,7 +54,7 @@ def make_logger(
     run_dir: Path, text: io.StringIO | None = None, sinks: tuple[Sink, ...] = (), **changes: Any
 ) -> RunLogger:
     console = Console(file=text or io.StringIO(), width=200)
-    return RunLogger(make_info(run_dir, **changes), sinks, console=console)
+    return RunLogger([make_info(run_dir, **changes)], [sinks], console=console)
 
 
 def read_rows(run_dir: Path) -> list[dict[str, str]]:
@@ -198,7 +198,7 @@ def test_plain_lines_tell_the_state(tmp_path: Path, clock: FakeTime) -> None:
 def test_terminal_shows_a_live_panel(tmp_path: Path) -> None:
     text = io.StringIO()
     console = Console(file=text, force_terminal=True, width=120)
-    with RunLogger(make_info(tmp_path), console=console) as logger:
+    with RunLogger([make_info(tmp_path)], console=console) as logger:
         with logger.compiling("train_epoch"):
             logger._terminal._live.refresh()  # type: ignore[union-attr]
         logger.log(500, 1000, {"return": 42.0, "critic_loss": 0.125})
@@ -280,7 +280,7 @@ def test_names_of_a_run_may_hold_any_line_separator(tmp_path: Path) -> None:
     odd = {**IDENTITY, "run": "a\u2028b"}
     for resume, value in ((None, 1.0), (10, 2.0)):
         changed = RunInfo(tmp_path, odd, info.total_env_steps, "train", resume, MEASURES, LEARNING)
-        with RunLogger(changed, console=Console(file=io.StringIO())) as logger:
+        with RunLogger([changed], console=Console(file=io.StringIO())) as logger:
             logger.log(10 * int(value), 0, {"q_mean": value})
     assert values_of(tmp_path, "q_mean") == [1.0, 2.0]
     assert {row["run"] for row in read_rows(tmp_path)} == {"a\u2028b"}

@@ -8,7 +8,6 @@ import json
 import shutil
 import threading
 from pathlib import Path
-from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -22,8 +21,10 @@ from twirl_mjx.training import guards, loop, pipeline, rundir, state
 from twirl_mjx.training.checkpoint import Checkpoints, load_learner, load_replay
 from twirl_mjx.training.config import TrainConfig
 from twirl_mjx.training.presets import make_config
+from twirl_mjx.training.run import Part
 from twirl_mjx.training.rundir import RunDir
 from twirl_mjx.training.state import TrainState
+from twirl_mjx.worlds.make import make_env
 
 
 def read_rows(path: Path) -> list[dict[str, str]]:
@@ -34,11 +35,11 @@ def read_rows(path: Path) -> list[dict[str, str]]:
 
 def final_state(config: TrainConfig, run_dir: Path) -> TrainState:
     """Return the state stored by a finished run."""
-    run = loop.Run(config, RunDir(run_dir), None, "test")
+    batch = loop.Batch([Part(config, RunDir(run_dir))], "test")
     try:
-        return run.start(None)
+        return batch.start()
     finally:
-        run.close()
+        batch.close()
 
 
 def train(config: TrainConfig, run_dir: Path) -> rundir.Finished:
@@ -186,9 +187,8 @@ def test_a_finished_run_without_checkpoints_is_not_trained_anew(
 
 
 def test_worlds_that_only_diverge_stop_the_run() -> None:
-    counts = SimpleNamespace(inserted=jnp.int32(0), env_steps=jnp.int32(64))
     with pytest.raises(guards.DivergedError, match="none of 64 transitions was finite"):
-        guards.check_experience(counts)  # type: ignore[arg-type]
+        guards.check_experience(0, 64)
 
 
 def test_finished_run_is_left_alone(stand_config: TrainConfig, whole_run: Path) -> None:
@@ -216,11 +216,11 @@ def test_stop_event_saves_and_ends_the_loop(
     stand_config: TrainConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     event = threading.Event()
-    original = loop.Run.evaluate
+    original = loop.Batch.evaluate
 
-    def stop_after_evaluation(run: loop.Run, train_state: TrainState) -> dict[str, float]:
+    def stop_after_evaluation(batch: loop.Batch, states: TrainState) -> dict[str, np.ndarray]:
         event.set()
-        return original(run, train_state)
+        return original(batch, states)
 
     class AlwaysThisEvent:
         def __enter__(self) -> threading.Event:
@@ -230,7 +230,7 @@ def test_stop_event_saves_and_ends_the_loop(
             return None
 
     monkeypatch.setattr(loop, "stop_on_signal", AlwaysThisEvent)
-    monkeypatch.setattr(loop.Run, "evaluate", stop_after_evaluation)
+    monkeypatch.setattr(loop.Batch, "evaluate", stop_after_evaluation)
     with pytest.raises(pipeline.StoppedError, match="stopped stopped at 64 transitions"):
         train(stand_config, tmp_path / "stopped")
     checkpoints = Checkpoints(tmp_path / "stopped")
@@ -239,7 +239,7 @@ def test_stop_event_saves_and_ends_the_loop(
 
 
 def test_epoch_is_traced_once_and_donates(stand_config: TrainConfig) -> None:
-    env = loop.make_env(stand_config)
+    env = make_env(stand_config)
     traces = 0
     observe = env.task.observer.observe
 
@@ -277,12 +277,12 @@ def test_diverged_learner_names_the_tensor(stand_config: TrainConfig, whole_run:
 def test_source_data_are_required(tmp_path: Path) -> None:
     config = make_config("biped", "debug")
     with pytest.raises(ValueError, match="needs source data"):
-        loop.train(config, RunDir(tmp_path / "x"))
+        loop.train([Part(config, RunDir(tmp_path / "x"))])
     assert not (tmp_path / "x").exists()
 
 
 def test_non_finite_world_never_reaches_the_ring(stand_config: TrainConfig) -> None:
-    env = loop.make_env(stand_config)
+    env = make_env(stand_config)
     train_state = state.init(stand_config, env, jax.random.key(0), None)
     data = train_state.env.data
     poisoned = data.replace(qvel=data.qvel.at[1, 0].set(jnp.nan))

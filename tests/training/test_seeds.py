@@ -14,9 +14,11 @@ import pytest
 from twirl_mjx.droq import learner as droq
 from twirl_mjx.policies.learned import load_policy
 from twirl_mjx.replay import ring
-from twirl_mjx.training import loop, seeds, state
+from twirl_mjx.training import seeds, state
 from twirl_mjx.training.config import TrainConfig
 from twirl_mjx.training.presets import make_config
+from twirl_mjx.training.run import Part, Run
+from twirl_mjx.training.rundir import RunDir
 from twirl_mjx.training.state import TrainState
 from twirl_mjx.types import Metrics
 from twirl_mjx.worlds.make import make_env
@@ -115,13 +117,14 @@ def test_seeds_differ(batch_stages: Stages) -> None:
 
 
 def test_one_seed_can_be_saved(
-    stand_config: TrainConfig, batch_stages: Stages, tmp_path: Path
+    stand_config: TrainConfig, env: VectorEnv, batch_stages: Stages, tmp_path: Path
 ) -> None:
     chosen = seeds.seed_state(batch_stages[3][0], 1)
     config = dataclasses.replace(stand_config, seed=SEEDS[1])
-    run = loop.Run(config, tmp_path / "seed5", None, "test")
+    run = Run(Part(config, RunDir(tmp_path / "seed5")), env, "test")
     try:
-        run.save_policy("policy.npz", chosen, {})
+        counts = {"env_steps": 96, "grad_steps": int(chosen.learner.grad_steps)}
+        run.save_policy(run.run_dir.policy, chosen.learner.actor, counts, {})
     finally:
         run.close()
     policy = load_policy(tmp_path / "seed5" / "policy.npz")

@@ -37,7 +37,8 @@ def make_info(run_dir: Path, resume: int | None = None) -> RunInfo:
 def open_logger(
     run_dir: Path, resume: int | None = None, sinks: tuple[Sink, ...] = ()
 ) -> RunLogger:
-    return RunLogger(make_info(run_dir, resume), sinks, console=Console(file=io.StringIO()))
+    info = make_info(run_dir, resume)
+    return RunLogger([info], [sinks], console=Console(file=io.StringIO()))
 
 
 def read_events(run_dir: Path) -> list[Event]:

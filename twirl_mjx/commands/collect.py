@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from twirl_mjx.commands.console import say
-from twirl_mjx.commands.options import parse_train
+from twirl_mjx.commands.options import parse_collect
 from twirl_mjx.commands.waiting import waiting
 from twirl_mjx.tasks.imitate import ImitateOptions
 from twirl_mjx.training.config import TrainConfig
@@ -14,7 +14,7 @@ from twirl_mjx.training.presets import starts_from_nominal_run
 
 def main(argv: list[str]) -> int:
     """Record a source policy in a target task as ``runs/<name>/source.npz``."""
-    options = parse_train(argv, "twirl collect")
+    options = parse_collect(argv)
     with waiting("loading the trainer"):  # orbax and more, which options do not need
         from twirl_mjx.training import pipeline, rundir
         from twirl_mjx.training.sinks.registry import resolve

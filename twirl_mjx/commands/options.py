@@ -13,6 +13,7 @@ from typing import Annotated, Any
 
 import tyro
 
+from twirl_mjx.checks import check_range
 from twirl_mjx.commands.console import parse
 from twirl_mjx.plugins import is_reference
 from twirl_mjx.tasks.registry import TASKS
@@ -22,11 +23,8 @@ from twirl_mjx.worlds.config import NO_OVERRIDES, DynamicsOverrides, WorldConfig
 
 
 @dataclasses.dataclass(frozen=True)
-class TrainOptions:
-    """Train a task (`collect`: only record its source), with every stage before it that is missing.
-
-    The same command resumes.
-    """
+class CollectOptions:
+    """Record the source of a run as a dataset, with every stage before it that is missing."""
 
     preset: str
     """Settings to start from: paper, cpu or debug (default: cpu without an accelerator)."""
@@ -40,12 +38,51 @@ class TrainOptions:
     config: Annotated[TrainConfig, tyro.conf.arg(name="")]
 
 
-def parse_train(argv: list[str], prog: str = "twirl train") -> TrainOptions:
-    """Parse training options: ``--task`` and ``--preset`` choose the defaults of the others.
+@dataclasses.dataclass(frozen=True)
+class TrainOptions(CollectOptions):
+    """Train a task, with every stage before it that is missing.
+
+    The same command resumes.
+    """
+
+    seeds: tuple[int, ...] = ()
+    """Several seeds in one program, each with the run directory that --seed gives it; with --name X
+    they are X-s0, X-s1, ... Finished ones are skipped, the others go on from the newest checkpoint
+    that all of them have."""
+    minutes: float | None = None
+    """Save and stop after this wall time, when the epoch under way is done; the same command
+    resumes (default: no limit)."""
+
+
+def parse_train(argv: list[str]) -> TrainOptions:
+    """Parse the options of ``twirl train``.
+
+    Raises:
+        ValueError: Unknown task or preset, a value out of range, or --seed beside --seeds.
+    """
+    options = _parse(argv, "twirl train", TrainOptions)
+    if options.minutes is not None:
+        check_range("minutes", options.minutes, 0.001, 1e7)
+    if options.seeds and options.config.seed != TrainConfig.seed:
+        seeds = " ".join(map(str, options.seeds))
+        raise ValueError(
+            f"--seed {options.config.seed} beside --seeds {seeds}: give one of them (nearest:"
+            f" --seeds {seeds})"
+        )
+    return options
+
+
+def parse_collect(argv: list[str]) -> CollectOptions:
+    """Parse the options of ``twirl collect``.
 
     Raises:
         ValueError: Unknown task or preset, or a value out of range.
     """
+    return _parse(argv, "twirl collect", CollectOptions)
+
+
+def _parse[T: CollectOptions](argv: list[str], prog: str, options: type[T]) -> T:
+    """Parse training options: ``--task`` and ``--preset`` choose the defaults of the others."""
     first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     first.add_argument("--task", default=TrainConfig.task)
     first.add_argument("--preset", default=None)
@@ -56,15 +93,16 @@ def parse_train(argv: list[str], prog: str = "twirl train") -> TrainOptions:
     config = make_config(known.task, preset, known.learner)
     shown = _shown(config)
     kind = dataclasses.make_dataclass(
-        TrainOptions.__name__,
+        options.__name__,
         [("config", Annotated[type(shown), tyro.conf.arg(name="")])],
-        bases=(TrainOptions,),
+        bases=(options,),
         frozen=True,
-        namespace={"__doc__": TrainOptions.__doc__},
+        namespace={"__doc__": options.__doc__},
     )
     found: Any = parse(kind, argv, prog, kind(preset, None, Path(known.runs), (), shown))
     values = {f.name: getattr(found.config, f.name) for f in dataclasses.fields(TrainConfig)}
-    return TrainOptions(found.preset, found.name, found.runs, found.log, TrainConfig(**values))
+    given: dict[str, Any] = {f.name: getattr(found, f.name) for f in dataclasses.fields(options)}
+    return options(**given | {"config": TrainConfig(**values)})
 
 
 def _shown(config: TrainConfig) -> TrainConfig:

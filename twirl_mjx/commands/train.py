@@ -12,8 +12,16 @@ def main(argv: list[str]) -> int:
     options = parse_train(argv)
     with waiting("loading the trainer"):  # orbax and more, which options do not need
         from twirl_mjx.training import pipeline
-    run_dir = pipeline.run(
-        options.config, options.preset, options.runs, options.name, say, sinks=options.log
+    run_dirs = pipeline.run_seeds(
+        options.config,
+        options.seeds or None,
+        options.preset,
+        options.runs,
+        options.name,
+        say,
+        sinks=options.log,
+        deadline=pipeline.deadline_after(options.minutes),
     )
-    say(f"done: {run_dir} (policy.npz, metrics.csv, eval.csv); film it: twirl render {run_dir}")
+    shown = " ".join(map(str, run_dirs))
+    say(f"done: {shown} (policy.npz, metrics.csv, eval.csv); film it: twirl render {run_dirs[0]}")
     return 0

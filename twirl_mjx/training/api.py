@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable, Mapping, Sequence
+import typing
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -52,21 +53,32 @@ class RunResult:
         return {name: (steps, values) for name, (steps, values) in curves.items()}
 
 
+@typing.overload
+def train(task: str | type[Task], *, seeds: Iterable[int], **settings: Any) -> list[RunResult]: ...
+
+
+@typing.overload
+def train(task: str | type[Task], *, seeds: None = None, **settings: Any) -> RunResult: ...
+
+
 def train(
     task: str | type[Task],
     *,
+    seeds: Iterable[int] | None = None,
     preset: str | None = None,
     source: str | SourcePolicy | None = None,
     name: str | None = None,
     runs: Path | str = "runs",
     sinks: Sequence[str | Sink] = (),
     say: Callable[[str], None] = print,
+    minutes: float | None = None,
     **settings: Any,
-) -> RunResult:
+) -> RunResult | list[RunResult]:
     """Train a task to its budget, with every stage before it that is missing; resumes.
 
     Args:
         task: Name, ``file.py:Name``, or a task class of your own.
+        seeds: Several seeds, trained in one program: a list of results, in their order.
         preset: ``paper``, ``cpu`` or ``debug``; ``cpu`` without an accelerator, else ``paper``.
         source: A policy object (``types.SourcePolicy``), or what ``--source`` takes.
         name: Name of the run; derived from task, variant, preset and seed by default.
@@ -74,13 +86,15 @@ def train(
         sinks: Where metrics go beside ``metrics.csv``, TensorBoard and the terminal: names
             (``wandb``), ``file.py:Name``, or objects (``training.sinks.base.Sink``).
         say: Prints one line for a person.
+        minutes: Save and stop after this wall time, when the epoch under way is done.
         **settings: Settings of the run by name (``seed=1``, ``shift="icy"``,
             ``total_env_steps=50_000``); those of a part as a mapping (``droq={"utd": 1.0}``,
             ``biped={"distance_weight": 4.0}``).
 
     Raises:
         ValueError: An unknown name or a value out of range, with the nearest valid choice.
-        StoppedError: A signal stopped it after saving; the same call resumes.
+        StoppedError: A signal, or the end of its time, stopped it after saving; the same call
+            resumes.
     """
     use_cache()
     registered = task if isinstance(task, str) else TASKS.register(task).name
@@ -98,7 +112,21 @@ def train(
         kind = type(source)
         given = Source(source, f"object {kind.__qualname__}", f"{kind.__module__}.{kind.__name__}")
     config = settle(make_config(registered, preset), flat)
-    run_dir = pipeline.run(config, preset, Path(runs), name, say, given, sinks)
+    several = None if seeds is None else list(seeds)
+    if several is not None and "seed" in settings:
+        raise ValueError(f"seed {settings['seed']} beside seeds {several}: give one of them")
+    deadline = pipeline.deadline_after(minutes)
+    run_dirs = pipeline.run_seeds(
+        config, several, preset, Path(runs), name, say, given, sinks, deadline
+    )
+    configs = (
+        [config] if several is None else [dataclasses.replace(config, seed=s) for s in several]
+    )
+    results = [_result(*each) for each in zip(run_dirs, configs, strict=True)]
+    return results[0] if several is None else results
+
+
+def _result(run_dir: RunDir, config: TrainConfig) -> RunResult:
     done = run_dir.finished()
-    assert done is not None, "pipeline.run returns finished runs"
+    assert done is not None, "the pipeline returns finished runs"
     return RunResult(run_dir.path, config, done.measures)

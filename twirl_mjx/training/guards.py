@@ -7,8 +7,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from twirl_mjx.training.state import TrainState
-
 
 class DivergedError(RuntimeError):
     """The learner produced a number that is not finite; the last good checkpoint is kept."""
@@ -35,14 +33,18 @@ def check_finite(learner: Any) -> None:
             )
 
 
-def check_experience(train_state: TrainState) -> None:
+def check_experience(inserted: int, env_steps: int) -> None:
     """Check that the worlds give transitions to learn from.
+
+    Args:
+        inserted: Transitions kept so far.
+        env_steps: Transitions gathered so far.
 
     Raises:
         DivergedError: Every transition so far had a state that is not finite and was dropped.
     """
-    if not int(train_state.inserted):
+    if env_steps and not inserted:
         raise DivergedError(
-            f"none of {int(train_state.env_steps):,} transitions was finite: the worlds diverge"
+            f"none of {env_steps:,} transitions was finite: the worlds diverge"
             " from the start; look at the task's options and at the dynamics"
         )

@@ -1,4 +1,4 @@
-"""Hands the metrics of a run to its sinks, with the rates of the epoch added."""
+"""Hands the metrics of runs in step to their sinks, with the rates of the epoch added."""
 
 from __future__ import annotations
 
@@ -19,41 +19,67 @@ from twirl_mjx.training.sinks.tensorboard import TensorBoard
 from twirl_mjx.training.sinks.terminal import Terminal
 
 
-class RunLogger:
-    """Writes one run's metrics and shows its progress; a context manager.
+class _Books:
+    """The sinks of one run, but for the terminal, which all runs share."""
 
-    Every ``log`` appends to ``metrics.csv`` and TensorBoard and forces both to disk, so a killed
-    run loses nothing it has reported; then come the terminal and the sinks that were chosen.
+    def __init__(self, run: RunInfo, chosen: Sequence[Sink]) -> None:
+        run.directory.mkdir(parents=True, exist_ok=True)
+        self.run = run
+        self.declared = {**run.measures, **run.learning}
+        self.chosen = list(chosen)
+        table = Table()
+        self.open: list[Sink] = []
+        for sink in (table, TensorBoard()):
+            sink.open(run)
+            self.open.append(sink)
+        self.start = time.monotonic() - table.earlier_s
+        """When the run would have begun, had it run without a pause."""
+        self.lacks = table.lacks
+
+
+class RunLogger:
+    """Writes the metrics of runs in step and shows their progress; a context manager.
+
+    Every ``log`` appends to every ``metrics.csv`` and TensorBoard and forces both to disk, so a
+    killed run loses nothing it has reported; then come the terminal, which shows mean and range
+    over the runs, and the sinks that were chosen.
     """
 
     def __init__(
-        self, run: RunInfo, sinks: Sequence[Sink] = (), *, console: Console | None = None
+        self,
+        runs: Sequence[RunInfo],
+        sinks: Sequence[Sequence[Sink]] = (),
+        *,
+        name: str | None = None,
+        console: Console | None = None,
     ) -> None:
         """Open every sink.
 
         Args:
-            run: The stage of the run.
-            sinks: What to log to beside the built-in three.
+            runs: The stage of S runs that are equally far.
+            sinks: What each of them logs to beside the built-in three; none by default.
+            name: What the runs are called together; the name of the first by default.
             console: where progress goes; standard output by default.
 
         Raises:
-            ValueError: A foreign ``metrics.csv`` lies in the directory.
+            ValueError: A foreign ``metrics.csv`` lies in a directory.
         """
-        run.directory.mkdir(parents=True, exist_ok=True)
-        self._declared = {**run.measures, **run.learning}
         self._terminal = Terminal(console or Console())
-        self._chosen = list(sinks)
-        table = Table()
-        self._open: list[Sink] = []
-        for sink in (table, TensorBoard(), self._terminal):
-            sink.open(run)
-            self._open.append(sink)
-        if table.lacks:
-            self.announce(table.lacks)
-        self._each_chosen(lambda sink: sink.open(run))
-        self._start = time.monotonic() - table.earlier_s
+        self._books: list[_Books] = []
+        self._left: set[int] = set()
+        try:
+            for run, chosen in zip(runs, sinks or [()] * len(runs), strict=True):
+                self._books.append(_Books(run, chosen))
+        except BaseException:
+            self.close()
+            raise
+        self._terminal.open(runs[0], name, len(runs))
+        for books in self._books:
+            if books.lacks:
+                self.announce(books.lacks)
+            self._each_chosen(books, lambda sink, run=books.run: sink.open(run))
         self._compile_s = self._aside_s = 0.0
-        self._last = (0, 0, time.monotonic()) if not run.resume_env_steps else None
+        self._last = (0, 0, time.monotonic()) if not runs[0].resume_env_steps else None
 
     def __enter__(self) -> RunLogger:
         return self
@@ -65,23 +91,39 @@ class RunLogger:
         """Report one epoch; NaN means undefined (no episode ended) and is left out.
 
         Args:
-            env_steps: transitions gathered so far.
-            grad_steps: critic updates so far.
-            metrics: name to scalar; the rates are added unless given.
+            env_steps: transitions of each run so far.
+            grad_steps: critic updates of each run so far.
+            metrics: name to scalar, or to one value of each run [S]; the rates are added unless
+                given.
 
         Raises:
             ValueError: a name that neither training nor the task or learner declares.
         """
-        values = {name: float(np.asarray(value)) for name, value in metrics.items()}
-        for name in values:
-            describe(name, self._declared)
+        shape = (len(self._books),)
+        given = {name: np.broadcast_to(np.asarray(v), shape) for name, v in metrics.items()}
         env_steps, grad_steps = int(env_steps), int(grad_steps)
-        values = {**self._rates(env_steps, grad_steps), **values}
-        defined = MappingProxyType({k: v for k, v in values.items() if not math.isnan(v)})
-        wall_s = time.monotonic() - self._start
-        for sink in self._open:
-            sink.log(env_steps, grad_steps, wall_s, defined)
-        self._each_chosen(lambda sink: sink.log(env_steps, grad_steps, wall_s, defined))
+        rates = self._rates(env_steps, grad_steps)
+        shown: list[Mapping[str, float]] = []
+        for index, books in enumerate(self._books):
+            if index in self._left:
+                continue
+            values = rates | {name: float(value[index]) for name, value in given.items()}
+            for name in given:
+                describe(name, books.declared)
+            defined = MappingProxyType({k: v for k, v in values.items() if not math.isnan(v)})
+            wall_s = time.monotonic() - books.start
+            for sink in books.open:
+                sink.log(env_steps, grad_steps, wall_s, defined)
+            shown.append(defined)
+            self._each_chosen(
+                books, lambda sink, w=wall_s, d=defined: sink.log(env_steps, grad_steps, w, d)
+            )
+        self._terminal.log(env_steps, grad_steps, shown)
+
+    def leave(self, index: int) -> None:
+        """Close the sinks of a run that goes on no more, although others do."""
+        self._left.add(index)
+        self._close(self._books[index])
 
     def announce(self, text: str) -> None:
         """Print one line above the progress."""
@@ -118,18 +160,23 @@ class RunLogger:
 
     def close(self) -> None:
         """Close every sink; harmless when repeated."""
-        self._each_chosen(lambda sink: sink.close())
-        self._chosen.clear()
-        while self._open:
-            self._open.pop().close()
+        for books in self._books:
+            self._close(books)
+        self._terminal.close()
 
-    def _each_chosen(self, call: Callable[[Sink], None]) -> None:
+    def _close(self, books: _Books) -> None:
+        self._each_chosen(books, lambda sink: sink.close())
+        books.chosen.clear()
+        while books.open:
+            books.open.pop().close()
+
+    def _each_chosen(self, books: _Books, call: Callable[[Sink], None]) -> None:
         """Call every sink that was chosen; one that fails is announced and dropped."""
-        for sink in tuple(self._chosen):
+        for sink in tuple(books.chosen):
             try:
                 call(sink)
             except Exception as error:
-                self._chosen.remove(sink)
+                books.chosen.remove(sink)
                 why = f"{type(error).__name__}: {' '.join(str(error).split())}"
                 self.announce(f"sink {type(sink).__name__} failed and is dropped: {why}")
 

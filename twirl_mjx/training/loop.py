@@ -1,4 +1,7 @@
-"""The Python loop around the compiled epoch: logging, evaluation, checkpoints, signals."""
+"""The Python loop around the compiled epoch: logging, evaluation, checkpoints, signals.
+
+It runs a batch of seeds; a run alone is a batch of one (``program``).
+"""
 
 from __future__ import annotations
 
@@ -6,269 +9,327 @@ import dataclasses
 import math
 import threading
 import time
-from collections.abc import Callable, Sequence
-from pathlib import Path
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from twirl_mjx.evaluation.rollout import ActFn, make_evaluate
-from twirl_mjx.policies.learned import NumpyPolicy, PolicyHeader, load_policy, save_policy
-from twirl_mjx.replay.ring import RingBuffer
-from twirl_mjx.tasks.measures import episode_means, measures_of
-from twirl_mjx.tasks.observations import layout_slices
-from twirl_mjx.training import config_json, rundir, state
-from twirl_mjx.training.checkpoint import Checkpoints
-from twirl_mjx.training.config import TrainConfig
-from twirl_mjx.training.guards import check_experience, check_finite
-from twirl_mjx.training.learners import check_learner, learner_of
+from twirl_mjx.policies.learned import NumpyPolicy, load_policy
+from twirl_mjx.tasks.measures import episode_means
+from twirl_mjx.training import program
+from twirl_mjx.training.checkpoint import stored_steps
+from twirl_mjx.training.guards import DivergedError, check_experience, check_finite
+from twirl_mjx.training.learners import check_learner
 from twirl_mjx.training.logger import RunLogger
+from twirl_mjx.training.program import Program
+from twirl_mjx.training.run import Part, Run
 from twirl_mjx.training.rundir import RunDir
 from twirl_mjx.training.signals import stop_on_signal
-from twirl_mjx.training.sinks.base import RunInfo, Sink
 from twirl_mjx.training.sinks.table import FINAL
 from twirl_mjx.training.state import TrainState
-from twirl_mjx.types import Learner, MetricInfo
-from twirl_mjx.worlds.make import make_env
-from twirl_mjx.worlds.vector import VectorEnv
 
 
 @dataclasses.dataclass(frozen=True)
 class Outcome:
-    """How a call of :func:`train` ended."""
+    """How a call of :func:`train` ended for one seed."""
 
     finished: bool
-    """False when a signal stopped the run; the same command resumes it."""
+    """False when a signal, or the end of its time, stopped it; the same command resumes it."""
     env_steps: int
     final: dict[str, float]
     """Mean measures of the closing evaluation of the best policy; empty unless finished."""
 
 
-def act_mean(learner: Learner) -> ActFn:
-    """Return how a learner's actor acts in evaluation: deterministically, without memory."""
+def common_step(run_dirs: Mapping[int, RunDir]) -> int | None:
+    """Return the newest checkpoint that all runs have; None when none has any.
 
-    def act(params: Any, memory: Any, env_state: Any, key: jax.Array) -> tuple[jax.Array, Any]:
-        return learner.mean(params, env_state.obs), memory
+    A batch that was killed while it saved has written the checkpoint of some seeds and not of
+    others: all of them go on from the one before.
 
-    return act
+    Args:
+        run_dirs: Directories of the runs, by seed.
 
-
-def no_memory(env_state: Any) -> tuple[()]:
-    """Return the memory of a policy that has none."""
-    return ()
-
-
-def make_header(config: TrainConfig, env: VectorEnv, card: dict[str, Any]) -> PolicyHeader:
-    """Return the header of a policy file of this run."""
-    layout = env.task.observer.layout
-    slices = layout_slices(layout)
-    return PolicyHeader(
-        task=config.task,
-        observation_size=env.observation_size,
-        action_size=env.action_size,
-        control_dt=env.control_dt,
-        observation_layout=tuple(
-            (e.name, slices[e.name].start, slices[e.name].stop, e.unit) for e in layout
-        ),
-        config_digest=rundir.digest(config),
-        versions=rundir.versions(),
-        card=card,
+    Raises:
+        ValueError: They have checkpoints, and none in common.
+    """
+    stored = {seed: stored_steps(run_dir.path) for seed, run_dir in run_dirs.items()}
+    if not any(stored.values()):
+        return None
+    common = set.intersection(*map(set, stored.values()))
+    if common:
+        return max(common)
+    groups: dict[int, list[int]] = {}
+    for seed, steps in stored.items():
+        groups.setdefault(max(steps, default=0), []).append(seed)
+    told = ", ".join(
+        f"--seeds {' '.join(map(str, seeds))} ({f'at {step:,}' if step else 'without any'})"
+        for step, seeds in sorted(groups.items())
+    )
+    raise ValueError(
+        "one program trains seeds that are equally far, and these have no checkpoint in common;"
+        f" nothing was touched. Train them in groups: {told}"
     )
 
 
-class Run:
-    """One training run: owns the directory, the compiled functions and the loop's bookkeeping."""
+class Batch:
+    """The seeds of one config under way: the compiled functions and every run's books."""
 
-    def __init__(
-        self, config: TrainConfig, run_dir: RunDir, source: RingBuffer | None, stage: str
-    ) -> None:
+    def __init__(self, parts: Sequence[Part], stage: str, deadline: float = math.inf) -> None:
         """Build (not compile) everything.
 
+        Args:
+            parts: S seeds whose configs differ in nothing else.
+            stage: Name shown with the progress.
+            deadline: ``time.monotonic()`` after which no epoch is begun.
+
         Raises:
-            ValueError: A function of the learner does not do what ``types.Learner`` says.
+            ValueError: A function of the learner does not do what ``types.Learner`` says, or the
+                configs differ.
         """
+        config = parts[0].config
+        if any(dataclasses.replace(part.config, seed=config.seed) != config for part in parts):
+            raise ValueError("the runs of one program must differ in nothing but their seeds")
         self.config = config
-        self.run_dir = run_dir
-        self.env = make_env(config)
-        check_learner(config.droq, self.env.observation_size, self.env.action_size)
-        self.replay_ratio = config.droq.utd * config.droq.batch_size
-        self.checkpoints = Checkpoints(run_dir.path)
-        self.stage = stage
-        self.source = source
-        self.source_rows = 0.0 if source is None else float(source.size)
-        self.resumed_at: int | None = None
+        self._parts = parts
+        self._deadline = deadline
+        own = any(part.source is not parts[0].source for part in parts)
+        self.program = Program(config, len(parts), own_sources=own)
+        env = self.program.env
+        check_learner(config.droq, env.observation_size, env.action_size)
+        self.runs = [Run(part, env, stage) for part in parts]
         self.took_weights = False
-        self.progress: dict[str, Any] = {"best": -math.inf, "wall_s": 0.0, "inserted": 0}
-        env = make_env(config.evaluation)
-        self._evaluate = make_evaluate(env, no_memory, act_mean(learner_of(config.droq)))
-        self._epoch = state.compile_epoch(config, self.env)
 
-    def info(self) -> RunInfo:
-        """Return what sinks are told; call it after :meth:`start`, which may resume."""
-        measures = measures_of(self.env.task).items()
-        return RunInfo(
-            directory=self.run_dir.path,
-            identity=self.run_dir.identity(self.config),
-            total_env_steps=self.config.total_env_steps,
-            stage=self.stage,
-            resume_env_steps=self.resumed_at,
-            measures={name: MetricInfo(measure.about, measure.unit) for name, measure in measures},
-            learning=learner_of(self.config.droq).metrics,
-            config=config_json.flatten(self.config),
-        )
+    @property
+    def live(self) -> list[Run]:
+        """The seeds that have not diverged."""
+        return [run for run in self.runs if run.fault is None]
 
-    def start(self, initial: Callable[[Any], Any] | None) -> TrainState:
+    @property
+    def resumed_at(self) -> int | None:
+        """Transitions of the checkpoint all seeds go on from; None: they begin."""
+        return self.runs[0].resumed_at
+
+    @property
+    def name(self) -> str:
+        """What the runs are called together."""
+        if len(self.runs) == 1:
+            return self.runs[0].run_dir.name
+        first = self.runs[0]
+        stem = first.run_dir.name.removesuffix(f"-s{first.config.seed}")
+        return f"{stem}, seeds {' '.join(str(run.config.seed) for run in self.runs)}"
+
+    def start(self) -> TrainState:
         """Return the state to begin or resume from.
 
-        Args:
-            initial: Changes the fresh learner, e.g. to start from source networks.
+        Raises:
+            ValueError: The seeds have checkpoints, and none in common.
         """
-
-        def fresh(key: jax.Array) -> TrainState:
-            return state.init(self.config, self.env, key, None)
-
-        key = jax.random.key(self.config.seed)
-        if self.checkpoints.latest() is None:
-            made = jax.jit(fresh)(key)
-            if initial is not None:
-                made = made.replace(learner=initial(made.learner))
+        step = common_step({run.config.seed: run.run_dir for run in self.runs})
+        if step is None:
+            states = self.program.init([run.config.seed for run in self.runs])
+            if any(part.initial for part in self._parts):
+                fresh = program.split(states.learner, len(self.runs))
+                begun = [
+                    part.initial(learner) if part.initial else learner
+                    for part, learner in zip(self._parts, fresh, strict=True)
+                ]
+                states = states.replace(learner=program.join(begun))
                 self.took_weights = True
         else:
-            made, progress = self.checkpoints.restore(jax.eval_shape(fresh, key))
-            self.resumed_at = int(made.env_steps)
-            self.progress |= progress
-        return made.replace(replay=made.replay.replace(source=self.source))
+            template = self.program.template()
+            states = self.program.stack(self._restored(template, step))
+        return self.program.with_sources(states, [part.source for part in self._parts])
 
-    def evaluate(self, train_state: TrainState) -> dict[str, float]:
-        """Evaluate the deterministic policy on the evaluation seed; keep the best policy."""
-        values = self._evaluate(train_state.learner.actor, jax.random.key(self.config.eval.seed))
-        means = episode_means(values)
-        self.save_policy(self.run_dir.last_policy, train_state, means)
-        if means["return"] > self.progress["best"]:
-            self.progress["best"] = means["return"]
-            self.save_policy(self.run_dir.policy, train_state, means)
-        return {f"eval/{name}": v for name, v in means.items()}
-
-    def save_policy(self, path: Path, train_state: TrainState, means: dict[str, float]) -> None:
-        """Write the present actor as a policy file of the run."""
-        card = {
-            "seed": self.config.seed,
-            "variant": self.config.variant,
-            "shift": self.config.shift,
-            "env_steps": int(train_state.env_steps),
-            "grad_steps": int(train_state.learner.grad_steps),
-            "replay_ratio": self.replay_ratio,
-            "wall_s": round(self.progress["wall_s"], 1),
-            "options": dataclasses.asdict(self.config.options),
-            "evaluation": means,
-        }
-        actor = jax.tree.map(np.asarray, train_state.learner.actor)
-        save_policy(path, actor, make_header(self.config, self.env, card))
-
-    def save(self, train_state: TrainState) -> None:
-        """Write a checkpoint; refuses a state that is not finite."""
-        check_finite(train_state.learner)
-        self.progress["inserted"] = int(train_state.inserted)
-        self.checkpoints.save(train_state, self.progress)
+    def _restored(self, template: TrainState, step: int) -> list[TrainState]:
+        """Return the checkpoints of all seeds at a step, at an earlier one if one is damaged."""
+        while True:
+            states = [run.restore(template, step) for run in self.runs]
+            reached = min(int(state.env_steps) for state in states)
+            if reached == step:
+                return states
+            earlier = common_step({run.config.seed: run.run_dir for run in self.runs})
+            assert earlier is not None and earlier < step, "what was damaged has been deleted"
+            step = earlier
 
     def close(self) -> None:
-        """Release the checkpoint manager."""
-        self.checkpoints.close()
+        """Release the checkpoint managers."""
+        for run in self.runs:
+            run.close()
 
-    def loop(self, train_state: TrainState, logger: RunLogger, stop: threading.Event) -> TrainState:
-        """Run epochs until the budget is spent or ``stop`` is set; checkpoints on the way."""
+    def evaluate(self, states: TrainState) -> dict[str, np.ndarray]:
+        """Evaluate the deterministic policies on the evaluation seed; keep the best ones.
+
+        Returns:
+            Mean measures by name, [S]; NaN where a measure is not defined, or a seed diverged.
+        """
+        actors = states.learner.actor
+        found = self.program.evaluate(actors, jax.random.key(self.config.eval.seed))
+        counts = {"env_steps": int(states.env_steps), "grad_steps": grad_steps(states)}
+        means = [
+            run.evaluated(actor, counts, values) if run.fault is None else {}
+            for run, actor, values in zip(
+                self.runs, program.split(actors, len(self.runs)), found, strict=True
+            )
+        ]
+        return by_name("eval/", means)
+
+    def save(self, states: TrainState) -> None:
+        """Write a checkpoint of every seed that has not diverged."""
+        for index, run in enumerate(self.runs):
+            if run.fault is None:
+                run.save(self.program.seed_state(states, index))
+
+    def guard(self, states: TrainState, logger: RunLogger) -> None:
+        """Take the seeds that diverged out of the books; the others go on.
+
+        Raises:
+            DivergedError: All have.
+        """
+        learners = program.split(states.learner, len(self.runs))
+        inserted = np.atleast_1d(np.asarray(states.inserted))
+        for index, run in enumerate(self.runs):
+            if run.fault is not None:
+                continue
+            try:
+                check_finite(learners[index])
+                check_experience(int(inserted[index]), int(states.env_steps))
+            except DivergedError as error:
+                run.fault = error
+                if self.live:
+                    logger.leave(index)
+                    logger.announce(f"{run.run_dir.name} stops, the others go on: {error}")
+        if not self.live:
+            raise self.faults()
+
+    def faults(self) -> DivergedError:
+        """Return the error of the seeds that diverged."""
+        if len(self.runs) == 1 and self.runs[0].fault:
+            return self.runs[0].fault
+        told = [f"{run.run_dir.name}: {run.fault}" for run in self.runs if run.fault]
+        return DivergedError("\n".join(told))
+
+    def loop(self, states: TrainState, logger: RunLogger, stop: threading.Event) -> TrainState:
+        """Run epochs until the budget is spent or it is time to stop; checkpoints on the way."""
         config = self.config
         saved = began = time.monotonic()
-        before = self.progress["wall_s"]
+        before = self.runs[0].progress["wall_s"]
         first = True
+        fixed = {
+            "replay_ratio": self.runs[0].replay_ratio,
+            "source_rows": np.array([run.source_rows for run in self.runs]),
+        }
         if self.took_weights:  # what training has to beat
+            self.guard(states, logger)
             with logger.aside("evaluating the weights taken over ..."):
-                logger.log(0, 0, self.evaluate(train_state))
-        while (steps := int(train_state.env_steps)) < config.total_env_steps and not stop.is_set():
+                logger.log(0, 0, self.evaluate(states))
+        while (steps := int(states.env_steps)) < config.total_env_steps and not (
+            stop.is_set() or self.is_late()
+        ):
             if first:
                 with logger.compiling("train_epoch"):
-                    train_state, metrics = self._epoch(train_state)
+                    states, metrics = self.program.epoch(states)
                     jax.block_until_ready(metrics)
                 first = False
             else:
-                train_state, metrics = self._epoch(train_state)
-            values = {name: float(value) for name, value in metrics.items()}
-            values |= {"replay_ratio": self.replay_ratio, "source_rows": self.source_rows}
-            check_finite(train_state.learner)
-            check_experience(train_state)
-            self.progress["wall_s"] = before + time.monotonic() - began
-            now = int(train_state.env_steps)
+                states, metrics = self.program.epoch(states)
+            values = {name: np.asarray(value) for name, value in metrics.items()} | fixed
+            self.guard(states, logger)
+            for run in self.live:
+                run.progress["wall_s"] = before + time.monotonic() - began
+            now = int(states.env_steps)
             if now // config.eval.every > steps // config.eval.every or (
                 now >= config.total_env_steps
             ):
                 with logger.aside("evaluating ..."):
-                    values |= self.evaluate(train_state)
-            logger.log(now, int(train_state.learner.grad_steps), values)
+                    values |= self.evaluate(states)
+            logger.log(now, grad_steps(states), values)
             if time.monotonic() - saved > 60.0 * config.checkpoint_minutes:
-                self.save(train_state)
+                self.save(states)
                 saved = time.monotonic()
-        self.save(train_state)
-        return train_state
+        self.save(states)
+        return states
+
+    def is_late(self) -> bool:
+        """Return whether the time that was given is over."""
+        return time.monotonic() >= self._deadline
+
+
+def grad_steps(states: TrainState) -> int:
+    """Return the critic updates of every seed; all have as many."""
+    return int(np.max(np.asarray(states.learner.grad_steps)))
+
+
+def by_name(prefix: str, means: Sequence[Mapping[str, float]]) -> dict[str, np.ndarray]:
+    """Return the measures of S seeds as arrays [S], NaN where one is not defined."""
+    names = dict.fromkeys(name for each in means for name in each)
+    return {prefix + name: np.array([each.get(name, math.nan) for each in means]) for name in names}
 
 
 def train(
-    config: TrainConfig,
-    run_dir: RunDir,
-    *,
-    source: RingBuffer | None = None,
-    initial: Callable[[Any], Any] | None = None,
-    stage: str = "train",
-    sinks: Sequence[Sink] = (),
-) -> Outcome:
-    """Train (or resume) one run to its budget.
+    parts: Sequence[Part], *, stage: str = "train", deadline: float = math.inf
+) -> list[Outcome]:
+    """Train (or resume) the seeds of one config to their budget, in one program.
 
     Args:
-        config: The run; its ``total_env_steps`` is rounded up to whole epochs.
-        run_dir: Its directory, judged to be new or resumable (``RunDir.status``).
-        source: Frozen source experience; needed when ``config.uses_source_data``.
-        initial: Changes the fresh learner before the first transition.
+        parts: The seeds; ``total_env_steps`` is rounded up to whole epochs.
         stage: Name shown with the progress.
-        sinks: Where metrics go beside ``metrics.csv``, TensorBoard and the terminal.
+        deadline: ``time.monotonic()`` after which no epoch is begun.
+
+    Returns:
+        How it ended for every seed.
 
     Raises:
-        DivergedError: The learner is no longer finite.
-        ValueError: Source data are needed and missing.
+        DivergedError: The learner of a seed is no longer finite; the others were trained first.
+        ValueError: Source data are needed and missing, or the seeds cannot go on together.
     """
-    if config.uses_source_data and source is None:
-        raise ValueError(f"variant {config.variant} with phi {config.replay.phi} needs source data")
-    run_dir.open(config)
-    run = Run(config, run_dir, source, stage)
+    for config, source in ((part.config, part.source) for part in parts):
+        if config.uses_source_data and source is None:
+            raise ValueError(
+                f"variant {config.variant} with phi {config.replay.phi} needs source data"
+            )
+    for part in parts:
+        part.run_dir.open(part.config)
+    batch = Batch(parts, stage, deadline)
     try:
-        train_state = run.start(initial)
-        steps = run.resumed_at or 0
-        with stop_on_signal() as stop, RunLogger(run.info(), sinks) as logger:
+        states = batch.start()
+        steps = batch.resumed_at or 0
+        infos = [run.info() for run in batch.runs]
+        sinks = [part.sinks for part in parts]
+        with stop_on_signal() as stop, RunLogger(infos, sinks, name=batch.name) as logger:
             if steps:
-                logger.announce(f"resuming {run_dir.name} at {steps:,} transitions")
-            if run.checkpoints.stepped_over:
-                logger.announce(run.checkpoints.stepped_over)
-            train_state = run.loop(train_state, logger, stop)
-            steps = int(train_state.env_steps)
-            if steps < config.total_env_steps:
-                logger.announce(f"stopped at {steps:,} transitions; the same command resumes")
-                return Outcome(False, steps, {})
+                logger.announce(f"resuming {batch.name} at {steps:,} transitions")
+            for run in batch.runs:
+                if run.checkpoints.stepped_over:
+                    logger.announce(run.checkpoints.stepped_over)
+            states = batch.loop(states, logger, stop)
+            steps = int(states.env_steps)
+            if steps < batch.config.total_env_steps:
+                why = "stopped" if stop.is_set() else "the time is over: stopped"
+                logger.announce(f"{why} at {steps:,} transitions; the same command resumes")
+                return [Outcome(False, steps, {})] * len(parts)
             with logger.aside("final evaluation ..."):
-                values = final_evaluation(config, run_dir)
-            final = episode_means(values)
-            last = {FINAL + name: value for name, value in final.items()}
-            logger.log(steps, int(train_state.learner.grad_steps), last)
-            run_dir.write_episodes(config, steps, values)  # last: it says that the run is finished
-            return Outcome(True, steps, final)
+                closing = final_evaluation(batch.live)
+            found = iter(closing)
+            each = [{} if run.fault else episode_means(next(found)) for run in batch.runs]
+            logger.log(steps, grad_steps(states), by_name(FINAL, each))
+            for run, values in zip(batch.live, closing, strict=True):  # last: they are finished
+                run.run_dir.write_episodes(run.config, steps, values)
+        if len(batch.live) < len(parts):
+            raise batch.faults()
+        return [Outcome(True, steps, means) for means in each]
     finally:
-        run.close()
+        batch.close()
 
 
-def final_evaluation(config: TrainConfig, run_dir: RunDir) -> dict[str, np.ndarray]:
-    """Evaluate the best policy of a run on fresh seeds; return measures [E]."""
-    policy = load_policy(run_dir.policy)
-    assert isinstance(policy, NumpyPolicy), "a run writes .npz policies"
-    actor = jax.tree.map(jnp.asarray, dict(policy.actor_params))
-    env = make_env(config.evaluation, num_envs=config.eval.final_episodes)
-    evaluate = make_evaluate(env, no_memory, act_mean(learner_of(config.droq)))
-    return evaluate(actor, jax.random.key(config.eval.seed + 1))
+def final_evaluation(runs: Sequence[Run]) -> list[dict[str, np.ndarray]]:
+    """Evaluate the best policy of every run on fresh seeds; return measures [E] of each."""
+    config = runs[0].config
+    policies = [load_policy(run.run_dir.policy) for run in runs]
+    actors: list[Any] = []
+    for policy in policies:
+        assert isinstance(policy, NumpyPolicy), "a run writes .npz policies"
+        actors.append(jax.tree.map(jnp.asarray, dict(policy.actor_params)))
+    evaluate = program.compile_evaluation(config, len(runs), config.eval.final_episodes)
+    return evaluate(program.join(actors), jax.random.key(config.eval.seed + 1))

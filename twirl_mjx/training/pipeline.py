@@ -7,9 +7,12 @@ shift the source is a finished nominal run of the same task, and its replay is t
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import hashlib
 import json
+import math
+import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -19,18 +22,18 @@ import jax.numpy as jnp
 
 from twirl_mjx import exits, records
 from twirl_mjx.checks import choose_one
-from twirl_mjx.droq.state import DroqState
 from twirl_mjx.policies import recorded
 from twirl_mjx.policies.foreign import MAX_CLIPPED
 from twirl_mjx.policies.resolve import SCRIPTED_SOURCES, Source, resolve_policy
 from twirl_mjx.replay import dataset, ring
 from twirl_mjx.training import loop, rundir, source_rules
-from twirl_mjx.training.checkpoint import has_checkpoint, load_replay
+from twirl_mjx.training.checkpoint import load_replay
 from twirl_mjx.training.config import TrainConfig
 from twirl_mjx.training.presets import make_config
+from twirl_mjx.training.run import Part
 from twirl_mjx.training.rundir import Busy, Finished, Foreign, RunDir
 from twirl_mjx.training.sinks.base import Sink
-from twirl_mjx.training.sinks.registry import resolve
+from twirl_mjx.training.sinks.registry import resolve_each
 from twirl_mjx.training.source import collect
 from twirl_mjx.training.weights import check_weights_fit, source_weights
 from twirl_mjx.worlds.make import make_env
@@ -39,7 +42,7 @@ Say = Callable[[str], None]
 
 
 class StoppedError(RuntimeError):
-    """A stage was stopped by a signal; the same command resumes."""
+    """A stage was stopped by a signal, or its time was over; the same command resumes."""
 
     exit_status = exits.STOPPED
 
@@ -52,6 +55,7 @@ def run(
     say: Say,
     source: Source | None = None,
     sinks: Sequence[str | Sink] = (),
+    deadline: float = math.inf,
 ) -> RunDir:
     """Train a task to its budget, with every stage before it that is missing.
 
@@ -63,37 +67,140 @@ def run(
         say: Prints one line for a person.
         source: The source itself, instead of what ``config.source`` says.
         sinks: Where metrics go beside the usual three, by name or as objects; see ``sinks``.
+        deadline: ``time.monotonic()`` after which a stage saves and stops.
 
     Returns:
         The run directory.
 
     Raises:
-        StoppedError: A signal stopped a stage after saving it.
+        StoppedError: A signal or the deadline stopped a stage after saving it.
         ValueError: The variant does not fit the task, or the source does not fit the variant.
         RunMismatchError: Another run lives there, or a finished one that cannot go on.
         RunBusyError: Another process works in the run directory.
     """
-    sinks = resolve(sinks)
-    run_dir = RunDir(runs_dir / rundir.check_name(name or rundir.default_name(config, preset)))
-    check_early(config, preset, run_dir, source)
-    if config.variant != "scratch" and source is None:
-        if _outlived_its_source(config, preset, runs_dir, run_dir):
-            say(f"{run_dir} is finished; its source is no longer there to compare")
-            return run_dir
-        source = find_source(config, preset, runs_dir, say, sinks)
-    with run_dir.exclusive():
-        match run_dir.status(config, source.identity if source else None):
-            case Foreign(error) | Busy(error):
-                raise error
-            case Finished():
-                say(f"{run_dir} is finished")
-            case _ if source is None:
-                _train(config, run_dir, None, None, sinks)
-            case _ if config.variant == "zero-shot":
-                zero_shot(config, run_dir, source, say)
-            case _:
-                _train_from(config, run_dir, source, say, sinks)
-    return run_dir
+    return run_seeds(config, None, preset, runs_dir, name, say, source, sinks, deadline)[0]
+
+
+def run_seeds(
+    config: TrainConfig,
+    seeds: Sequence[int] | None,
+    preset: str,
+    runs_dir: Path,
+    name: str | None,
+    say: Say,
+    source: Source | None = None,
+    sinks: Sequence[str | Sink] = (),
+    deadline: float = math.inf,
+) -> list[RunDir]:
+    """Train several seeds of one config in one program; each gets the run it would have alone.
+
+    Finished seeds are left as they are. The others go on together from the newest checkpoint that
+    all of them have. Every seed has the source, and the source experience, of its own run.
+
+    Args:
+        config: The run; its seed does not matter where ``seeds`` are given.
+        seeds: All different; None: the one of ``config``, under the plain ``name``.
+        preset: As in :func:`run`, like the rest.
+        runs_dir: Folder of all runs.
+        name: Seed ``s`` gets ``name-s{s}``; the names they have alone by default.
+        say: Prints one line for a person.
+        source: The source itself, one for all.
+        sinks: Every seed has its own, so a sink is a class here, not an object.
+        deadline: ``time.monotonic()`` after which a stage saves and stops.
+
+    Returns:
+        The run directories, in the order of the seeds.
+
+    Raises:
+        ValueError: As :func:`run`; or no seed, equal seeds, or seeds without a common checkpoint.
+    """
+    configs = [config]
+    names = [name]
+    if seeds is not None:
+        check_seeds(seeds)
+        configs = [dataclasses.replace(config, seed=seed) for seed in seeds]
+        names = [name and f"{name}-s{seed}" for seed in seeds]
+    found = [
+        RunDir(runs_dir / rundir.check_name(name or rundir.default_name(config, preset)))
+        for config, name in zip(configs, names, strict=True)
+    ]
+    members = [
+        Member(*each) for each in zip(configs, found, resolve_each(sinks, len(found)), strict=True)
+    ]
+    _run_all(members, preset, runs_dir, say, source, deadline)
+    return found
+
+
+def deadline_after(minutes: float | None) -> float:
+    """Return the ``time.monotonic()`` at which so many minutes from now are over."""
+    return math.inf if minutes is None else time.monotonic() + 60.0 * minutes
+
+
+def check_seeds(seeds: Sequence[int]) -> None:
+    """Check the seeds of a batch.
+
+    Raises:
+        ValueError: There is none, or one occurs twice.
+    """
+    if not seeds:
+        raise ValueError("--seeds names no seed: give at least one, --seeds 0 1 2")
+    if len(set(seeds)) != len(seeds):
+        once = " ".join(str(seed) for seed in dict.fromkeys(seeds))
+        given = " ".join(map(str, seeds))
+        raise ValueError(f"--seeds {given} names a seed twice (nearest: --seeds {once})")
+
+
+@dataclasses.dataclass(frozen=True)
+class Member:
+    """One seed of those that are trained together."""
+
+    config: TrainConfig
+    """The run, with its own seed."""
+    run_dir: RunDir
+    """Its directory."""
+    sinks: tuple[Sink, ...] = ()
+    """Where its metrics go beside the usual three."""
+    source: Source | None = None
+    """What it starts from, once that is found."""
+
+
+def _run_all(
+    members: list[Member],
+    preset: str,
+    runs_dir: Path,
+    say: Say,
+    source: Source | None,
+    deadline: float,
+) -> None:
+    """Train members whose configs differ in their seeds only."""
+    for member in members:
+        check_early(member.config, preset, member.run_dir, source)
+    if members[0].config.variant != "scratch" and source is None:
+        alone = [m for m in members if _outlived_its_source(m.config, preset, runs_dir, m.run_dir)]
+        for member in alone:
+            say(f"{member.run_dir} is finished; its source is no longer there to compare")
+        members = [member for member in members if member not in alone]
+        sources = _find_sources(members, preset, runs_dir, say, deadline)
+        members = [
+            dataclasses.replace(member, source=found)
+            for member, found in zip(members, sources, strict=True)
+        ]
+    elif source is not None:
+        members = [dataclasses.replace(member, source=source) for member in members]
+    with contextlib.ExitStack() as held:
+        missing = []
+        for member in members:
+            held.enter_context(member.run_dir.exclusive())
+            known = member.source.identity if member.source else None
+            match member.run_dir.status(member.config, known):
+                case Foreign(error) | Busy(error):
+                    raise error
+                case Finished():
+                    say(f"{member.run_dir} is finished")
+                case _:
+                    missing.append(member)
+        if missing:
+            _train(missing, say, deadline)
 
 
 def check_early(
@@ -135,28 +242,35 @@ def _outlived_its_source(config: TrainConfig, preset: str, runs_dir: Path, run_d
             return not _nominal_dir(config, preset, runs_dir).path.exists()
 
 
-def _train_from(
-    config: TrainConfig, run_dir: RunDir, source: Source, say: Say, sinks: Sequence[Sink]
-) -> None:
-    fresh_weights = config.uses_source_weights and not has_checkpoint(run_dir.path)
-    initial = source_weights(config, source, say) if fresh_weights else None
-    run_dir.open(config, source.identity)
-    data = source_data(config, run_dir, source, say) if config.uses_source_data else None
-    _train(config, run_dir, data, initial, sinks)
-
-
-def _train(
-    config: TrainConfig,
-    run_dir: RunDir,
-    data: ring.RingBuffer | None,
-    initial: Callable[[DroqState], DroqState] | None,
-    sinks: Sequence[Sink],
-) -> None:
-    outcome = loop.train(
-        config, run_dir, source=data, initial=initial, stage=config.task, sinks=sinks
-    )
-    if not outcome.finished:
-        raise StoppedError(f"{run_dir.name} stopped at {outcome.env_steps:,} transitions")
+def _train(members: list[Member], say: Say, deadline: float) -> None:
+    """Train members that are new or resumable, from their sources."""
+    config = members[0].config
+    if config.variant == "zero-shot":
+        for member in members:
+            assert member.source is not None, "zero-shot has a source"
+            zero_shot(member.config, member.run_dir, member.source, say)
+        return
+    begun = loop.common_step({member.config.seed: member.run_dir for member in members})
+    rings: dict[Path, ring.RingBuffer] = {}
+    parts = []
+    for member in members:
+        config, run_dir, source = member.config, member.run_dir, member.source
+        data = initial = None
+        if source is not None:
+            if config.uses_source_weights and begun is None:
+                initial = source_weights(config, source, say)
+            run_dir.open(config, source.identity)
+            if config.uses_source_data:
+                replayed = config.shift != "none" and source.run_dir
+                place = replayed or run_dir.path  # one replay serves all seeds
+                if place not in rings:
+                    rings[place] = source_data(config, run_dir, source, say)
+                data = rings[place]
+        parts.append(Part(config, run_dir, data, initial, member.sinks))
+    outcomes = loop.train(parts, stage=config.task, deadline=deadline)
+    if not all(outcome.finished for outcome in outcomes):
+        names = ", ".join(part.run_dir.name for part in parts)
+        raise StoppedError(f"{names} stopped at {outcomes[0].env_steps:,} transitions")
 
 
 def find_source(
@@ -165,6 +279,7 @@ def find_source(
     runs_dir: Path,
     say: Say,
     sinks: Sequence[Sink] = (),
+    deadline: float = math.inf,
 ) -> Source:
     """Return the source of a run (``source_rules`` says which), training it when it is missing.
 
@@ -173,20 +288,34 @@ def find_source(
         FileNotFoundError: A path that does not exist, or no finished nominal run under a shift.
         ValueError: The task has no source of its own and none is named.
     """
+    name = rundir.default_name(config, preset)
+    member = Member(config, RunDir(runs_dir / name), tuple(sinks))
+    return _find_sources([member], preset, runs_dir, say, deadline)[0]
+
+
+def _find_sources(
+    members: Sequence[Member], preset: str, runs_dir: Path, say: Say, deadline: float
+) -> list[Source]:
+    """Return the source of every member; those that are missing are trained in one program."""
+    if not members:
+        return []
+    config = members[0].config
     noise = config.uses_source_data and config.replay.source_noise
 
     def at(path: Path) -> Source:
         terms = source_rules.terms_of(config)
         return resolve_policy(str(path), config.evaluation, noise=noise, terms=terms)
 
-    match source_rules.source_of(config, preset):
+    rules = [source_rules.source_of(member.config, preset) for member in members]
+    match rules[0]:
         case source_rules.NominalRun():
-            return at(_nominal_run(config, preset, runs_dir).path)
+            return [at(_nominal_run(m.config, preset, runs_dir).path) for m in members]
         case source_rules.Scripted(name):
-            return resolve_policy(name, config, terms=source_rules.terms_of(config))
+            terms = source_rules.terms_of(config)
+            return [resolve_policy(name, config, terms=terms)] * len(members)
         case source_rules.InFile(reference):
             terms = source_rules.terms_of(config)
-            return resolve_policy(reference, config.evaluation, terms=terms)
+            return [resolve_policy(reference, config.evaluation, terms=terms)] * len(members)
         case source_rules.AtPath(path, is_shipped):
             if is_shipped:
                 shown = f"assets/policies/{path.name}"
@@ -194,11 +323,21 @@ def find_source(
             recorded.refuse_format(str(path))
             if not path.exists():
                 raise FileNotFoundError(no_such_source(path, runs_dir))
-            return at(path)
-        case source_rules.RunOf(first):
-            run_dir = runs_dir / rundir.default_name(first, preset)
-            say(f"stage 1 of 3: source policy, task {first.task}, in {run_dir}")
-            return at(run(first, preset, runs_dir, None, say, sinks=sinks).path)
+            return [at(path)] * len(members)
+        case source_rules.RunOf():
+            first = [
+                Member(
+                    rule.config,
+                    RunDir(runs_dir / rundir.default_name(rule.config, preset)),
+                    member.sinks,
+                )
+                for rule, member in zip(rules, members, strict=True)
+                if isinstance(rule, source_rules.RunOf)
+            ]
+            for each in first:
+                say(f"stage 1 of 3: source policy, task {each.config.task}, in {each.run_dir}")
+            _run_all(first, preset, runs_dir, say, None, deadline)
+            return [at(each.run_dir.path) for each in first]
 
 
 def no_such_source(path: Path, runs_dir: Path) -> str:

@@ -15,6 +15,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 
 from twirl_mjx.replay.mixed import MixedReplay
 from twirl_mjx.replay.ring import RingBuffer
@@ -25,16 +26,18 @@ from twirl_mjx.types import Metrics
 from twirl_mjx.worlds.vector import VectorEnv
 
 
-def per_field(batched: Any, shared: Any) -> Any:
+def per_field(batched: Any, shared: Any, *, own_sources: bool = False) -> Any:
     """Return a prefix tree of ``TrainState``: ``batched`` where seeds differ, else ``shared``.
 
-    The source ring is read by all seeds, and all seeds are equally far: ``env_steps`` decides how
-    many updates follow a step, which must not differ within one program.
+    The source ring is read by all seeds unless they have ``own_sources``, and all seeds are equally
+    far: ``env_steps`` decides how many updates follow a step, which must not differ within one
+    program.
     """
+    source = batched if own_sources else shared
     return TrainState(
         learner=batched,
         env=batched,
-        replay=MixedReplay(source=shared, online=batched),
+        replay=MixedReplay(source=source, online=batched),
         tracker=batched,
         key=batched,
         env_steps=shared,
@@ -65,7 +68,7 @@ def init_seeds(
     """
     if not seeds or len(set(seeds)) != len(seeds):
         raise ValueError(f"seeds {list(seeds)} must be at least one, all different")
-    keys = jax.vmap(jax.random.key)(jax.numpy.asarray(seeds, jax.numpy.uint32))
+    keys = jax.vmap(jax.random.key)(jnp.asarray(seeds, jnp.uint32))
 
     def fresh(key: jax.Array) -> TrainState:
         return single.init(config, env, key, None)
@@ -75,26 +78,28 @@ def init_seeds(
 
 
 def batch_epoch(
-    config: TrainConfig, env: VectorEnv
+    config: TrainConfig, env: VectorEnv, *, own_sources: bool = False
 ) -> Callable[[TrainState], tuple[TrainState, Metrics]]:
     """Return ``train_epoch`` of a batch of seeds, not compiled; metrics are [S] each."""
     epoch = functools.partial(single.train_epoch, config, env)
-    return jax.vmap(epoch, in_axes=(AXES,), out_axes=(AXES, 0))
+    axes = per_field(0, None, own_sources=own_sources)
+    return jax.vmap(epoch, in_axes=(axes,), out_axes=(axes, 0))
 
 
 def compile_epoch_seeds(
-    config: TrainConfig, env: VectorEnv
+    config: TrainConfig, env: VectorEnv, *, own_sources: bool = False
 ) -> Callable[[TrainState], tuple[TrainState, Metrics]]:
     """Return the jitted epoch of a batch of seeds; it donates its argument.
 
     Args:
         config: The run.
         env: The worlds of one seed.
+        own_sources: Whether every seed has a source ring of its own (``stack_rings``).
 
     Returns:
         A function of a state from ``init_seeds``; its metrics are [S] each.
     """
-    return jax.jit(batch_epoch(config, env), donate_argnums=0)
+    return jax.jit(batch_epoch(config, env, own_sources=own_sources), donate_argnums=0)
 
 
 def num_seeds(states: TrainState) -> int:
@@ -118,4 +123,37 @@ def seed_state(states: TrainState, index: int) -> TrainState:
     def pick(axis: int | None, subtree: Any) -> Any:
         return subtree if axis is None else jax.tree.map(lambda leaf: leaf[index], subtree)
 
-    return jax.tree.map(pick, AXES, states, is_leaf=lambda axis: axis is None)
+    source = states.replay.source
+    axes = per_field(0, None, own_sources=source is not None and source.rows.ndim == 3)
+    return jax.tree.map(pick, axes, states, is_leaf=lambda axis: axis is None)
+
+
+def stack_states(states: Sequence[TrainState]) -> TrainState:
+    """Return the batch of the states of several seeds, all equally far and without source rings.
+
+    Raises:
+        ValueError: They are not equally far.
+    """
+    steps = [int(state.env_steps) for state in states]
+    if len(set(steps)) != 1:
+        raise ValueError(f"seeds of one program must be equally far, these are at {steps}")
+
+    def put(axis: int | None, *subtrees: Any) -> Any:
+        if axis is None:
+            return subtrees[0]
+        return jax.tree.map(lambda *leaves: jnp.stack(leaves), *subtrees)
+
+    return jax.tree.map(put, AXES, *states, is_leaf=lambda axis: axis is None)
+
+
+def stack_rings(rings: Sequence[RingBuffer]) -> RingBuffer:
+    """Return the source rings of several seeds as one, rows [S, C, W].
+
+    C is the largest capacity; only the rows of its own ring are drawn for a seed, as alone.
+    """
+    capacity = max(ring.capacity for ring in rings)
+    padded = [
+        ring.replace(rows=jnp.pad(ring.rows, ((0, capacity - ring.capacity), (0, 0))))
+        for ring in rings
+    ]
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *padded)

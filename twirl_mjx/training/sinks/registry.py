@@ -27,6 +27,23 @@ def resolve(chosen: Sequence[str | Sink]) -> tuple[Sink, ...]:
     return tuple(_sink(one) for one in chosen)
 
 
+def resolve_each(chosen: Sequence[str | Sink], num_runs: int) -> list[tuple[Sink, ...]]:
+    """Return sinks of their own for every one of several runs that are under way together.
+
+    Raises:
+        ValueError: As :func:`resolve`, or a sink that can serve one run at a time only.
+    """
+    sinks = [resolve(chosen) for _ in range(num_runs)]
+    for one, *others in zip(*sinks, strict=True):
+        if others and (one is others[0] or isinstance(one, (Wandb, Trackio))):
+            what = type(one).__name__.lower()
+            raise ValueError(
+                f"sink {what} serves one run at a time, not {num_runs} seeds in one program"
+                " (nearest: --seed, one run after the other; or a class of your own, FILE.py:NAME)"
+            )
+    return sinks
+
+
 def _sink(chosen: str | Sink) -> Sink:
     made: object = chosen
     if isinstance(chosen, str):

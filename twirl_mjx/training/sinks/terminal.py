@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 from rich.console import Console, Group, RenderableType
 from rich.live import Live
@@ -53,19 +53,26 @@ def format_seconds(seconds: float | None) -> str:
     return f"{whole // 3600}:{whole // 60 % 60:02d}:{whole % 60:02d}"
 
 
+def written(form: str, values: Sequence[float]) -> str:
+    """Return a number, or the mean and the range of several that look different."""
+    low, high = form.format(min(values)), form.format(max(values))
+    mean = form.format(math.fsum(values) / len(values))
+    return mean if low == high else f"{mean} ({low} to {high})"
+
+
 def headlines(run: RunInfo) -> dict[str, tuple[str, str]]:
     """Return label and format of the metrics shown while a run goes on, in their order."""
 
-    def written(metrics: Mapping[str, MetricInfo], most: int) -> dict[str, tuple[str, str]]:
+    def labelled(metrics: Mapping[str, MetricInfo], most: int) -> dict[str, tuple[str, str]]:
         own = [name for name in metrics if name not in METRICS][:most]
         return {
             name: (name.replace("_", " "), FORMATS.get(unit, f"{{:.3g}} {unit}"))
             for name, unit in ((name, metrics[name].unit) for name in own)
         }
 
-    task = written(run.measures, SHOWN_MEASURES)
+    task = labelled(run.measures, SHOWN_MEASURES)
     evaluated = {f"eval/{name}": (f"eval {label}", form) for name, (label, form) in task.items()}
-    learning = written(run.learning, SHOWN_LEARNING)
+    learning = labelled(run.learning, SHOWN_LEARNING)
     return TRAINING | task | learning | RETURN | evaluated | DROPPED
 
 
@@ -77,12 +84,19 @@ class Terminal:
         self._live: Live | None = None
         self._busy: tuple[str, float] | None = None
 
-    def open(self, run: RunInfo) -> None:
-        """Begin to show a stage."""
-        self._stage, self._run = run.stage, run.identity["run"]
+    def open(self, run: RunInfo, name: str | None = None, num_runs: int = 1) -> None:
+        """Begin to show a stage.
+
+        Args:
+            run: The run, or the first of several in step.
+            name: What they are called together; the name of the run by default.
+            num_runs: How many they are.
+        """
+        self._stage, self._run = run.stage, name or run.identity["run"]
+        self._each = f" each of {num_runs} seeds" if num_runs > 1 else ""
         self._total = max(run.total_env_steps, 1)
         self._headlines = headlines(run)
-        self._values: dict[str, float] = {}
+        self._values: dict[str, list[float]] = {}
         self._env_steps, self._grad_steps = run.resume_env_steps or 0, 0
         self._opened = (time.monotonic(), self._env_steps)
         self._overall: float | None = None
@@ -94,7 +108,8 @@ class Terminal:
             self._live.start()
         else:
             begin = f" from {format_count(self._env_steps)}" if self._env_steps else ""
-            self.announce(f"{self._stage} {self._run}: to {format_count(self._total)}{begin}")
+            total = format_count(self._total)
+            self.announce(f"{self._stage} {self._run}: to {total}{self._each}{begin}")
 
     def close(self) -> None:
         """End the live display and leave its last state on the screen."""
@@ -120,13 +135,12 @@ class Terminal:
         if text and self._live is None:
             self.announce(text)
 
-    def log(
-        self, env_steps: int, grad_steps: int, wall_s: float, values: Mapping[str, float]
-    ) -> None:
-        """Take over one epoch."""
+    def log(self, env_steps: int, grad_steps: int, runs: Sequence[Mapping[str, float]]) -> None:
+        """Take over one epoch of every run; mean and range of what they report are shown."""
         self._env_steps, self._grad_steps = env_steps, grad_steps
-        self._values |= values
-        if "compile_s" in values:  # says nothing about the epochs to come
+        for name in dict.fromkeys(name for values in runs for name in values):
+            self._values[name] = [values[name] for values in runs if name in values]
+        if "compile_s" in runs[0]:  # says nothing about the epochs to come
             self._history.clear()
         self._history.append((time.monotonic(), env_steps))
         if self._live is None:
@@ -154,7 +168,7 @@ class Terminal:
     def _texts(self) -> list[tuple[str, str]]:
         """Return (label, text) of the headlines that are known."""
         known = [
-            (label, form.format(self._values[name]))
+            (label, written(form, self._values[name]))
             for name, (label, form) in self._headlines.items()
             if name in self._values
         ]
@@ -169,7 +183,9 @@ class Terminal:
         head.add_column(no_wrap=True)
         head.add_column(ratio=1)
         head.add_column(no_wrap=True, justify="right")
-        count = f"{format_count(self._env_steps)} / {format_count(self._total)} env steps"
+        count = (
+            f"{format_count(self._env_steps)} / {format_count(self._total)} env steps{self._each}"
+        )
         head.add_row(
             Text(self._stage, style="bold"),
             ProgressBar(total=self._total, completed=min(self._env_steps, self._total)),

@@ -1,0 +1,135 @@
+"""What is compiled for a batch of seeds; a batch of one is the program of a single run.
+
+A single seed has no batch axis: a conditional stays a conditional, and a run is bit for bit what
+it is without the words "batch" and "seed axis". Two seeds and more are the ``seeds`` axis.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import numpy as np
+
+from twirl_mjx.evaluation.rollout import ActFn, first_episodes, make_evaluate
+from twirl_mjx.replay.ring import RingBuffer
+from twirl_mjx.training import seeds as batch
+from twirl_mjx.training import state as single
+from twirl_mjx.training.config import TrainConfig
+from twirl_mjx.training.learners import learner_of
+from twirl_mjx.training.state import TrainState
+from twirl_mjx.types import Learner
+from twirl_mjx.worlds.make import make_env
+from twirl_mjx.worlds.vector import EnvState
+
+Evaluate = Callable[[Any, jax.Array], list[dict[str, np.ndarray]]]
+"""(actors of S seeds, key) -> the measures [E] of every seed."""
+
+
+def act_mean(learner: Learner) -> ActFn:
+    """Return how a learner's actor acts in evaluation: deterministically, without memory."""
+
+    def act(params: Any, memory: Any, env_state: Any, key: jax.Array) -> tuple[jax.Array, Any]:
+        return learner.mean(params, env_state.obs), memory
+
+    return act
+
+
+def no_memory(env_state: EnvState) -> tuple[()]:
+    """Return the memory of a policy that has none."""
+    return ()
+
+
+def split[T](tree: T, num_seeds: int) -> list[T]:
+    """Return every seed's part of arrays [S, ...]; one seed's arrays have no such axis."""
+    if num_seeds == 1:
+        return [tree]
+    return [jax.tree.map(lambda leaf, i=i: leaf[i], tree) for i in range(num_seeds)]
+
+
+def join[T](trees: Sequence[T]) -> T:
+    """Return the arrays [S, ...] of several seeds, the inverse of :func:`split`."""
+    if len(trees) == 1:
+        return trees[0]
+    return jax.tree.map(lambda *leaves: jax.numpy.stack(leaves), *trees)
+
+
+def compile_evaluation(
+    config: TrainConfig, num_seeds: int, num_envs: int | None = None
+) -> Evaluate:
+    """Return the evaluation of the actors of all seeds, in one compiled call.
+
+    Args:
+        config: The run; it is evaluated in ``config.evaluation``.
+        num_seeds: S.
+        num_envs: Episodes E of every seed, ``config.eval.episodes`` by default.
+    """
+    env = make_env(config.evaluation, num_envs=num_envs)
+    act = act_mean(learner_of(config.droq))
+    if num_seeds == 1:
+        one = make_evaluate(env, no_memory, act)
+        return lambda actor, key: [one(actor, key)]
+    episodes = functools.partial(first_episodes, env, no_memory, act)
+    run = jax.jit(jax.vmap(episodes, in_axes=(0, None)))
+
+    def evaluate(actors: Any, key: jax.Array) -> list[dict[str, np.ndarray]]:
+        return split({k: np.asarray(v) for k, v in run(actors, key).items()}, num_seeds)
+
+    return evaluate
+
+
+class Program:
+    """Everything that is compiled to train S seeds of one config."""
+
+    def __init__(self, config: TrainConfig, num_seeds: int, *, own_sources: bool = False) -> None:
+        """Build (not compile) the functions.
+
+        Args:
+            config: The run; its seed does not matter.
+            num_seeds: S.
+            own_sources: Whether every seed has a source ring of its own.
+        """
+        self.num_seeds = num_seeds
+        self.env = make_env(config)
+        self.evaluate = compile_evaluation(config, num_seeds)
+        self._config = config
+        self._own_sources = own_sources
+        self.epoch = (
+            single.compile_epoch(config, self.env)
+            if num_seeds == 1
+            else batch.compile_epoch_seeds(config, self.env, own_sources=own_sources)
+        )
+
+    def init(self, seeds: Sequence[int]) -> TrainState:
+        """Return the states of S seeds before the first transition, without source rings."""
+        if self.num_seeds == 1:
+            return jax.jit(self._fresh)(jax.random.key(seeds[0]))
+        return batch.init_seeds(self._config, self.env, seeds, None)
+
+    def template(self) -> TrainState:
+        """Return shapes and dtypes of the state of one seed."""
+        return jax.eval_shape(self._fresh, jax.random.key(0))
+
+    def _fresh(self, key: jax.Array) -> TrainState:
+        return single.init(self._config, self.env, key, None)
+
+    def stack(self, states: Sequence[TrainState]) -> TrainState:
+        """Return the states of S seeds as one.
+
+        Raises:
+            ValueError: They are not equally far.
+        """
+        return states[0] if self.num_seeds == 1 else batch.stack_states(states)
+
+    def seed_state(self, states: TrainState, index: int) -> TrainState:
+        """Return the state of one seed of the batch, for a checkpoint."""
+        return states if self.num_seeds == 1 else batch.seed_state(states, index)
+
+    def with_sources(self, states: TrainState, sources: Sequence[RingBuffer | None]) -> TrainState:
+        """Return the states with the source ring of every seed, or the one all seeds share."""
+        given = [source for source in sources if source is not None]
+        own = self._own_sources and self.num_seeds > 1
+        source = batch.stack_rings(given) if own else sources[0]
+        return states.replace(replay=states.replay.replace(source=source))
