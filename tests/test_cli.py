@@ -11,11 +11,12 @@ from typing import Any
 
 import pytest
 
-from twirl_mjx import cli
+from twirl_mjx import cli, files
 from twirl_mjx.commands import collect, demo, options, render
 from twirl_mjx.replay import dataset
 from twirl_mjx.sim.gl import RenderError
 from twirl_mjx.training import pipeline
+from twirl_mjx.training.rundir import RunDir
 
 
 def test_every_command_has_a_module_and_help(capsys: pytest.CaptureFixture[str]) -> None:
@@ -49,13 +50,10 @@ def test_unknown_command_suggests_the_nearest(capsys: pytest.CaptureFixture[str]
         (["evaluate", "trot", "--task", "stand", "--out", "."], "nearest: evaluation.csv"),
         (["evaluate", "trot", "--task", "stand", "--figure", "f.txt"], "nearest: f.png"),
         (["clip", "show", "none.json"], "none.json"),
-        (["evaluate", "trot", "--task", "biped", "--goal-distance", "0"], "nearest: 0.01"),
-        (["evaluate", "trot", "--task", "hurdles", "--hurdle-gap", "1"], "nearest: 1.4"),
-        (["evaluate", "trot", "--task", "stand", "--hurdle-gap", "2"], "option of task hurdles"),
-        (
-            ["evaluate", "trot", "--task", "stand", "--hurdle-gaps", "2", "3"],
-            "option of task hurdles",
-        ),
+        (["evaluate", "trot", "--task", "biped", "--biped.goal-distance", "0"], "nearest: 0.01"),
+        (["evaluate", "trot", "--task", "hurdles", "--hurdles.gap", "1"], "nearest: 1.4"),
+        (["evaluate", "trot", "--task", "stand", "--hurdles.gap", "2"], "option of task hurdles"),
+        (["render", "trot", "--task", "biped", "--shift", "icey"], "nearest: 'icy'"),
     ],
 )
 def test_bad_input_is_refused_before_anything_is_written(
@@ -89,7 +87,6 @@ def test_bad_option_is_refused_with_the_nearest(
         ("seconds", 0.0, r"seconds = 0\.0 is outside .*nearest: 0\.1"),
         ("seconds", float("nan"), "seconds = nan"),
         ("panels", 0, "panels = 0"),
-        ("shift", "icey", "nearest: 'icy'"),
     ],
 )
 def test_films_that_cannot_be_made_are_refused(option: str, value: Any, message: str) -> None:
@@ -162,19 +159,21 @@ def test_collect_says_what_happened(
     run_dir: Path | None, existing: bool, collects: bool, message: str, tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
 ) -> None:  # fmt: skip
-    def source_data(config: Any, target: Path, source: Any, say: Any) -> None:
-        if collects:
-            (target / "partial").write_text("data")
-            (target / "partial").replace(target / "source.npz")
+    writes = True
 
-    source = SimpleNamespace(identity={"origin": "x", "digest": "y"}, run_dir=run_dir)
+    def source_data(config: Any, target: RunDir, source: Any, say: Any) -> None:
+        if writes:
+            files.write_text(target.dataset, "data")
+
+    source = SimpleNamespace(identity={"origin": "x", "digest": "y"}, run_dir=run_dir, data=None)
     monkeypatch.setattr(pipeline, "find_source", lambda *_: source)
     monkeypatch.setattr(pipeline, "source_data", source_data)
     words = ["--task", "biped", "--preset", "debug", "--shift", "icy", "--runs", str(tmp_path)]
     path = tmp_path / "mine" / "source.npz"
     if existing:
-        path.parent.mkdir()
-        path.write_text("data")
+        assert collect.main([*words, "--name", "mine"]) == 0
+        capsys.readouterr()
+    writes = collects
     assert collect.main([*words, "--name", "mine"]) == 0
     said = capsys.readouterr().out
     assert message in said

@@ -13,12 +13,20 @@ def nearest(value: object, choices: Iterable[object]) -> str:
     return names[close[0]] if close else next(iter(names.values()))
 
 
+MOST_CHOICES = 32
+"""Names that fit a message a person still reads."""
+
+
 def choose_one(value: object, choices: Iterable[object]) -> str:
-    """Return "choose one of a, b (nearest: 'a')", the end of a refusal of ``value``."""
+    """Return "choose one of a, b (nearest: 'a')", the end of a refusal of ``value``.
+
+    Of more than ``MOST_CHOICES`` only the nearest is named.
+    """
     names = [str(name) for name in choices]
     if not names:
         return "there is none to choose"
-    return f"choose one of {', '.join(names)} (nearest: {nearest(value, names)!r})"
+    shown = ", ".join(names) if len(names) <= MOST_CHOICES else f"{len(names)}"
+    return f"choose one of {shown} (nearest: {nearest(value, names)!r})"
 
 
 def check_choice(what: str, value: str, choices: tuple[str, ...]) -> None:

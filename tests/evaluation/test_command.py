@@ -11,6 +11,7 @@ import pytest
 
 from twirl_mjx.commands import evaluate
 from twirl_mjx.commands.render import config_of, name_of
+from twirl_mjx.files import FileError
 from twirl_mjx.policies.learned import PolicyFileError, PolicyHeader, save_policy
 from twirl_mjx.training import rundir
 from twirl_mjx.training.presets import make_config
@@ -58,7 +59,7 @@ def test_a_bad_name_is_found_before_anything_is_scored(
     with pytest.raises(FileNotFoundError, match="nowhere"):
         run(out, "trot", good, "nowhere.npz", "--task", "stand")
     (tmp_path / "foreign.npz").write_bytes(b"no archive")
-    with pytest.raises(PolicyFileError, match="foreign"):
+    with pytest.raises(FileError, match="foreign"):
         run(out, good, str(tmp_path / "foreign.npz"))
     with pytest.raises(ValueError, match="option of task biped"):
         run(out, "trot", good, "--task", "stand", "--biped.goal-distance", "1")

@@ -24,7 +24,10 @@ def test_without_a_file_everything_has_a_default(tmp_path):
         ("[1]", r"grid\.json is \[1\], expected an object"),
         ('{"titel": "x"}', "unknown key 'titel': .*nearest: 'title'"),
         ('{"place": "first"}', "place is 'first', expected a int"),
-        ('{"measures": {"q": {"units": "m"}}}', r"measures\.q: unknown key 'units'; .*'unit'"),
+        (
+            '{"measures": {"q": {"units": "m"}}}',
+            r"measures\.q: unknown key 'units': .*nearest: 'unit'",
+        ),
         ('{"axes": {"tau": {"order": "0.1"}}}', r"axes\.tau: order is '0\.1', expected a list"),
         ('{"tasks": ["biped"]}', r"tasks is \['biped'\], expected an object"),
         ('{"baseline": "scratch"}', "baseline is 'scratch', expected an object"),

@@ -64,7 +64,7 @@ def finish(cell: Cell, runs: Path, *, steps: int | None = None, epochs: int = 25
         write_csv(run_dir / "metrics.csv", (*WHO, *columns), rows)
     rows = [
         [*who, steps, episode, metric, episode + config.seed]
-        for episode in range(4)
+        for episode in range(config.eval.final_episodes)
         for metric in ("return", "episode_length", "unlisted")
     ]
     write_csv(run_dir / "eval.csv", (*WHO, "env_steps", "episode", "metric", "value"), rows)

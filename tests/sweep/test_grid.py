@@ -48,8 +48,8 @@ def test_settings_are_applied_at_once() -> None:
         (block(seeds=()), "no cells"),
         ({"preset": "cpu", "seeds": (0,)}, "no 'axes'"),
         (block(axes={"t": {"x": {"replay.phi": 0.5}}}), "arm x has no 'task'"),
-        (block(base={"replay.fi": 0.5}), r"config field 'fi'.*nearest: 'phi'"),
-        (block(base={"repla.phi": 0.5}), r"config field 'repla'.*nearest: 'replay'"),
+        (block(base={"replay.fi": 0.5}), r"config field 'replay.fi'.*nearest: 'replay.phi'"),
+        (block(base={"repla.phi": 0.5}), r"config field 'repla.phi'.*nearest: 'replay.phi'"),
         (block(base={"replay.phi": 1.5}), r"replay.phi = 1.5 is outside \[0.0, 1.0\]"),
         (block(base={"droq.utd": 3.3}), "not a whole number of blocks"),
         (
