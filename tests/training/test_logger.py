@@ -212,7 +212,7 @@ def test_the_last_panel_of_a_run_of_one_epoch_shows_a_rate(tmp_path: Path, clock
     """Its only epoch is the one that was compiled, which has no rate of its own."""
     text = io.StringIO()
     console = Console(file=text, force_terminal=True, width=120)
-    with RunLogger(make_info(tmp_path), console=console) as logger:
+    with RunLogger([make_info(tmp_path)], console=console) as logger:
         with logger.compiling("train_epoch"):
             clock.now += 20.0
         logger.log(500, 1000, {"return": 42.0})

@@ -26,6 +26,9 @@ from twirl_mjx.training.rundir import RunDir
 from twirl_mjx.training.source import collect
 from twirl_mjx.worlds.make import make_env
 
+NOMINAL = "biped-twirl-debug-s0"
+"""Name under which an adaptation looks for its nominal run."""
+
 
 @pytest.fixture(scope="module")
 def biped() -> TrainConfig:
@@ -37,14 +40,14 @@ def runs(biped: TrainConfig, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a finished nominal biped run from a scripted source."""
     folder = tmp_path_factory.mktemp("runs")
     config = dataclasses.replace(biped, source="trot")
-    run_dir = pipeline.run(config, "debug", folder, None, print)
-    assert run_dir.name == "biped-twirl-debug-s0"
+    run_dir = pipeline.run(config, "debug", folder, NOMINAL, print)
+    assert run_dir.name == NOMINAL
     return folder
 
 
 def test_scripted_source_is_recorded_in_the_target_task(biped: TrainConfig, runs: Path) -> None:
     header, data = dataset.read(
-        runs / "biped-twirl-debug-s0" / "source.npz",
+        runs / NOMINAL / "source.npz",
         task="biped",
         observation_size=101,
         action_size=12,
@@ -59,7 +62,7 @@ def test_collected_data_are_used_again_until_settings_change(
     said: list[str] = []
     config = dataclasses.replace(biped, source="trot")
     source = pipeline.find_source(config, "debug", runs, said.append)
-    pipeline.source_data(config, RunDir(runs / "biped-twirl-debug-s0"), source, said.append)
+    pipeline.source_data(config, RunDir(runs / NOMINAL), source, said.append)
     assert any("source.npz" in line for line in said)
     assert not any("collecting" in line for line in said)
     other = dataclasses.replace(source, digest="another policy")
@@ -89,11 +92,11 @@ def test_source_networks_are_taken_over(biped: TrainConfig, runs: Path) -> None:
     initial = weights.source_weights(config, source, print)
     fresh = droq.init(jax.random.key(7), config.droq, 101, 12)
     taken = initial(fresh)
-    best = load_policy(runs / "biped-twirl-debug-s0")
+    best = load_policy(runs / NOMINAL)
     obs = np.random.default_rng(0).normal(size=(3, 101)).astype(np.float32)
     expected = droq.mean_action(taken.actor, jnp.asarray(obs))
     np.testing.assert_allclose(best.act(obs), np.asarray(expected), atol=1e-6)
-    stored = load_learner(runs / "biped-twirl-debug-s0")
+    stored = load_learner(runs / NOMINAL)
     jax.tree.map(np.testing.assert_array_equal, taken.critic, stored["critic"])
     jax.tree.map(
         lambda a, b: (
@@ -113,7 +116,7 @@ def test_weights_refuse_sources_that_do_not_fit(biped: TrainConfig, runs: Path) 
         weights.source_weights(scripted, source, print)
     hurdles = dataclasses.replace(make_config("hurdles", "debug"), variant="weights")
     source = pipeline.find_source(
-        dataclasses.replace(hurdles, source=str(runs / "biped-twirl-debug-s0")),
+        dataclasses.replace(hurdles, source=str(runs / NOMINAL)),
         "debug",
         runs,
         print,
@@ -123,7 +126,7 @@ def test_weights_refuse_sources_that_do_not_fit(biped: TrainConfig, runs: Path) 
 
 
 def test_replay_of_the_nominal_run_is_the_source(runs: Path) -> None:
-    rows = load_replay(runs / "biped-twirl-debug-s0", capacity=1000)
+    rows = load_replay(runs / NOMINAL, capacity=1000)
     assert rows.shape == (64, 2 * 101 + 12 + 2)
     assert np.isfinite(rows).all()
 
@@ -131,7 +134,7 @@ def test_replay_of_the_nominal_run_is_the_source(runs: Path) -> None:
 def test_onnx_source_acts_like_the_policy_it_came_from(
     biped: TrainConfig, runs: Path, tmp_path: Path
 ) -> None:
-    run_dir = runs / "biped-twirl-debug-s0"
+    run_dir = runs / NOMINAL
     onnx = export_onnx(run_dir, tmp_path / "policy.onnx")
     env = make_env(biped.evaluation, num_envs=2)
     key = jax.random.key(4)
@@ -144,32 +147,32 @@ def test_onnx_source_acts_like_the_policy_it_came_from(
 def test_directory_of_another_config_is_refused(biped: TrainConfig, runs: Path) -> None:
     other = dataclasses.replace(biped, source="trot", warmup_env_steps=0)
     with pytest.raises(rundir.RunMismatchError, match="warmup_env_steps: 32 -> 0"):
-        pipeline.run(other, "debug", runs, None, print)
+        pipeline.run(other, "debug", runs, NOMINAL, print)
 
 
 def test_another_source_is_refused_in_a_run_that_has_one(biped: TrainConfig, runs: Path) -> None:
-    run_dir = runs / "biped-twirl-debug-s0"
+    run_dir = runs / NOMINAL
     before = {name: (run_dir / name).read_bytes() for name in ("config.json", "source.npz")}
     other = dataclasses.replace(biped, source="bound")
     with pytest.raises(rundir.RunMismatchError, match="source digest: 'trot' -> 'bound'"):
-        pipeline.run(other, "debug", runs, None, print)
+        pipeline.run(other, "debug", runs, NOMINAL, print)
     assert before == {name: (run_dir / name).read_bytes() for name in before}
 
 
 def test_a_finished_run_is_left_as_it_is(biped: TrainConfig, runs: Path) -> None:
-    run_dir = runs / "biped-twirl-debug-s0"
+    run_dir = runs / NOMINAL
     (run_dir / "versions.json").write_text('{"commit": "of the training"}')
     before = {path: path.read_bytes() for path in run_dir.iterdir() if path.is_file()}
     said: list[str] = []
     shorter = dataclasses.replace(biped, source="trot", total_env_steps=32)
-    assert pipeline.run(shorter, "debug", runs, None, said.append).path == run_dir
+    assert pipeline.run(shorter, "debug", runs, NOMINAL, said.append).path == run_dir
     assert f"{run_dir} is finished" in said
     after = {path: path.read_bytes() for path in run_dir.iterdir() if path.is_file()}
     assert before == after
 
 
 def test_weights_act_and_are_measured_from_the_first_step(biped: TrainConfig, runs: Path) -> None:
-    path = runs / "biped-twirl-debug-s0"
+    path = runs / NOMINAL
     config = dataclasses.replace(
         biped, variant="weights", source=str(path), warmup_env_steps=64, total_env_steps=32
     )
@@ -196,10 +199,10 @@ def test_what_needs_no_source_is_refused_before_one_is_sought(
     trot = dataclasses.replace(biped, source="trot")
     other = dataclasses.replace(trot, droq=dataclasses.replace(biped.droq, tau=0.1))
     with pytest.raises(rundir.RunMismatchError, match="tau"):
-        pipeline.run(other, "debug", runs, None, print)
+        pipeline.run(other, "debug", runs, NOMINAL, print)
     monkeypatch.setattr(RunDir, "owner", lambda run_dir: "process 1 on mars")
     with pytest.raises(rundir.RunBusyError, match="in use by process 1 on mars"):
-        pipeline.run(trot, "debug", runs, None, print)
+        pipeline.run(trot, "debug", runs, NOMINAL, print)
 
 
 @pytest.mark.parametrize(
@@ -231,16 +234,16 @@ def test_a_finished_run_outlives_its_source(biped: TrainConfig, runs: Path, tmp_
     shutil.copytree(runs, folder)
     gone = dataclasses.replace(biped, source=str(tmp_path / "deleted.npz"))
     said: list[str] = []
-    run_dir = pipeline.run(gone, "debug", folder, None, said.append)
+    run_dir = pipeline.run(gone, "debug", folder, NOMINAL, said.append)
     assert said == [f"{run_dir} is finished; its source is no longer there to compare"]
     with pytest.raises(FileNotFoundError, match=r"deleted\.npz"):
         pipeline.run(
-            dataclasses.replace(gone, total_env_steps=96), "debug", folder, None, said.append
+            dataclasses.replace(gone, total_env_steps=96), "debug", folder, NOMINAL, said.append
         )
 
 
 def test_a_refused_run_leaves_its_name_free(biped: TrainConfig, runs: Path, tmp_path: Path) -> None:
-    path = str(runs / "biped-twirl-debug-s0")
+    path = str(runs / NOMINAL)
     wide = dataclasses.replace(biped.droq, num_critics=3)
     config = dataclasses.replace(biped, variant="weights", source=path, droq=wide)
     with pytest.raises(
@@ -299,7 +302,7 @@ def test_the_engine_does_not_decide_what_is_collected(biped: TrainConfig, runs: 
 def test_a_learned_source_is_noisy_only_while_its_data_are_collected(
     biped: TrainConfig, runs: Path
 ) -> None:
-    path = str(runs / "biped-twirl-debug-s0" / "policy.npz")
+    path = str(runs / NOMINAL / "policy.npz")
     state = SimpleNamespace(obs=jnp.zeros((3, 101)))
 
     def actions(config: TrainConfig) -> np.ndarray:
@@ -335,7 +338,7 @@ def test_weights_that_cannot_fit_are_refused_before_any_stage(
     wide = dataclasses.replace(
         biped,
         variant="weights",
-        source=str(runs / "biped-twirl-debug-s0"),
+        source=str(runs / NOMINAL),
         droq=dataclasses.replace(biped.droq, hidden_sizes=(64, 32)),
     )
     with pytest.raises(ValueError, match=r"hidden layers of \(32, 32\) units.*hidden-sizes 32 32"):
