@@ -59,7 +59,7 @@ def test_a_task_of_ones_own_is_trained_evaluated_and_read_back(
     runs = tmp_path / "runs"
     command = ["train", "--task", trot, "--trot.speed", "0.8", "--variant", "scratch"]
     assert cli.main([*command, "--preset", "debug", "--runs", str(runs)]) == 0
-    run_dir = RunDir(runs / "trot-scratch-debug-s0")
+    run_dir = RunDir(runs / "trot-scratch-debug-s0-speed_0.8")
     record = json.loads(run_dir.config.read_text())
     assert (record["task"], record["trot"]["speed"], record["uses"]) == ("trot", 0.8, [trot])
     config = run_dir.read_config()
@@ -204,7 +204,10 @@ def write_task(path: Path, start: str = START, judge: str = JUDGE, more: str = "
             {"start": START.replace("qpos=qpos,", "qpos=qpos[:12],")},
             r"Hop\.start: qpos is \[12\] float32, expected \[19\] float32",
         ),
-        ({"start": "        return 3\n"}, r"Hop\.start returned int, expected Start"),
+        (
+            {"start": "        return 3\n"},
+            r"Hop\.start returned a number or an array, expected Start",
+        ),
         (
             {"judge": JUDGE.replace("jnp.float32(1.0)", "jnp.ones(3)")},
             r"Hop\.judge: reward is \[3\] float32, expected \[\] float32",

@@ -201,7 +201,7 @@ class BareConfig:
 def test_settings_without_what_training_reads_are_refused(kind: type, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         learners.register(dataclasses.replace(CLONE, Config=kind))
-    assert kind not in learners.LEARNERS
+    assert "clone" not in learners.LEARNERS.names()
 
 
 @pytest.mark.parametrize("config", [DroqConfig(), DroqConfig(fast=False, utd=1.0)])
@@ -251,7 +251,7 @@ def test_what_a_learner_returns_is_checked_before_anything_is_compiled(
     function: str, made: Any, message: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     wrong = dataclasses.replace(CLONE, **{function: made})
-    monkeypatch.setitem(learners.LEARNERS, CloneConfig, wrong)
+    monkeypatch.setitem(learners.LEARNERS._items, wrong.name, wrong)
     with pytest.raises(ValueError, match=f"learner clone: {message}") as refusal:
         learners.check_learner(CloneConfig(), 7, 3)
     assert "\n" not in str(refusal.value)

@@ -31,7 +31,8 @@ def check_task(task: Task, scene: Scene) -> tuple[str, ...]:
     key = jax.eval_shape(lambda: jax.random.key(0))
     start = _traced(task, "start", lambda k: task.start(k, scene, dynamics), key)
     if not isinstance(start, Start):
-        raise ValueError(f"{_where(task, 'start')} returned {type(start).__name__}, expected Start")
+        found = _kind(start)
+        raise ValueError(f"{_where(task, 'start')} returned {found}, expected Start")
     model = scene.mj_model
     for part, size in (("qpos", model.nq), ("qvel", model.nv), ("goal", 2)):
         _expect(task, "start", part, getattr(start, part), (size,), jnp.float32)
@@ -57,7 +58,7 @@ def check_task(task: Task, scene: Scene) -> tuple[str, ...]:
 
     outcome, obs = _traced(task, "judge", judged, start)
     if not isinstance(outcome, Outcome):
-        found = type(outcome).__name__
+        found = _kind(outcome)
         raise ValueError(f"{_where(task, 'judge')} returned {found}, expected Outcome")
     _expect(task, "judge", "reward", outcome.reward, (), jnp.float32)
     _expect(task, "judge", "terminated", outcome.terminated, (), jnp.bool_)
@@ -108,6 +109,12 @@ def _check_state(task: Task, before: Any, after: Any) -> None:
             f"{_where(task, 'judge')}: the task's state is {form(after)[1]} in"
             f" {form(after)[0]}, expected that of start: {form(before)[1]} in {form(before)[0]}"
         )
+
+
+def _kind(found: Any) -> str:
+    """Return what a traced method gave; numbers have become arrays."""
+    is_array = isinstance(found, jax.ShapeDtypeStruct)
+    return "a number or an array" if is_array else type(found).__name__
 
 
 def _where(task: Task, method: str) -> str:
