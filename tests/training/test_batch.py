@@ -21,10 +21,11 @@ import twirl_mjx
 from twirl_mjx import cli, exits
 from twirl_mjx.replay import dataset, mixed, ring
 from twirl_mjx.training import loop, pipeline, seeds
-from twirl_mjx.training.checkpoint import stored_steps
+from twirl_mjx.training.checkpoint import Checkpoints, stored_steps
 from twirl_mjx.training.config import TrainConfig
 from twirl_mjx.training.guards import DivergedError
 from twirl_mjx.training.logger import RunLogger
+from twirl_mjx.training.program import Program
 from twirl_mjx.training.run import Part
 from twirl_mjx.training.rundir import RunDir
 from twirl_mjx.training.sinks.base import RunInfo, Sink
@@ -32,6 +33,7 @@ from twirl_mjx.training.sinks.registry import resolve_each
 from twirl_mjx.training.sinks.terminal import written
 from twirl_mjx.training.state import TrainState
 from twirl_mjx.types import MetricInfo
+from twirl_mjx.worlds.make import make_env
 
 SEEDS = (3, 5)
 
@@ -43,13 +45,19 @@ def train(config: TrainConfig, folder: Path, chosen: Sequence[int] = SEEDS) -> l
     return said
 
 
-def stored(config: TrainConfig, run_dir: Path) -> TrainState:
+@pytest.fixture(scope="module")
+def template(stand_config: TrainConfig) -> TrainState:
+    """Shapes and dtypes of the state of one run."""
+    return Program(stand_config, 1).template()
+
+
+def stored(template: TrainState, run_dir: Path) -> TrainState:
     """Return the newest checkpoint of one run, read as its own."""
-    batch = loop.Batch([Part(config, RunDir(run_dir))], "test")
+    checkpoints = Checkpoints(run_dir)
     try:
-        return batch.start()
+        return checkpoints.restore(template)[0]
     finally:
-        batch.close()
+        checkpoints.close()
 
 
 def assert_states(a: TrainState, b: TrainState, compare: Any) -> None:
@@ -103,28 +111,30 @@ def test_a_run_of_a_batch_looks_like_one_trained_alone(whole: Path, alone: Path)
 
 
 def test_its_state_is_that_of_the_seed_alone(
-    stand_config: TrainConfig, whole: Path, alone: Path
+    template: TrainState, whole: Path, alone: Path
 ) -> None:
-    config = dataclasses.replace(stand_config, seed=SEEDS[1])
-    a, b = stored(config, whole / "b-s5"), stored(config, alone)
+    a, b = stored(template, whole / "b-s5"), stored(template, alone)
     assert int(a.learner.grad_steps) == 64
     assert_states(a, b, lambda x, y: np.testing.assert_allclose(x, y, rtol=1e-4, atol=1e-4))
 
 
 def test_a_batch_resumes_bit_for_bit(
-    stand_config: TrainConfig, short_stand_config: TrainConfig, whole: Path, tmp_path: Path
+    stand_config: TrainConfig,
+    short_stand_config: TrainConfig,
+    template: TrainState,
+    whole: Path,
+    tmp_path: Path,
 ) -> None:
     train(short_stand_config, tmp_path)
     assert stored_steps(tmp_path / "b-s3") == [32, 64]
     train(stand_config, tmp_path)
     for seed in SEEDS:
-        config = dataclasses.replace(stand_config, seed=seed)
-        a, b = (stored(config, folder / f"b-s{seed}") for folder in (whole, tmp_path))
+        a, b = (stored(template, folder / f"b-s{seed}") for folder in (whole, tmp_path))
         assert_states(a, b, np.testing.assert_array_equal)
 
 
 def test_a_batch_killed_while_it_saved_goes_back_to_the_common_checkpoint(
-    stand_config: TrainConfig, whole: Path, tmp_path: Path
+    stand_config: TrainConfig, template: TrainState, whole: Path, tmp_path: Path
 ) -> None:
     folder = tmp_path / "killed"
     shutil.copytree(whole, folder)
@@ -133,9 +143,8 @@ def test_a_batch_killed_while_it_saved_goes_back_to_the_common_checkpoint(
     shutil.rmtree(folder / "b-s3" / "checkpoints" / "orbax" / "96")
     train(stand_config, folder)
     for seed in SEEDS:
-        config = dataclasses.replace(stand_config, seed=seed)
         assert stored_steps(folder / f"b-s{seed}") == [64, 96]
-        a, b = (stored(config, each / f"b-s{seed}") for each in (whole, folder))
+        a, b = (stored(template, each / f"b-s{seed}") for each in (whole, folder))
         assert_states(a, b, np.testing.assert_array_equal)
         now, then = (rows_of(each / f"b-s{seed}" / "metrics.csv") for each in (folder, whole))
         logged = [{(r["metric"], r["env_steps"]) for r in rows} for rows in (now, then)]
@@ -176,7 +185,11 @@ def test_a_seed_goes_on_alone(stand_config: TrainConfig, whole: Path, tmp_path: 
 
 
 def test_a_seed_that_diverges_stops_alone(
-    stand_config: TrainConfig, whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    stand_config: TrainConfig,
+    template: TrainState,
+    whole: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     def broken(learner: Any) -> Any:
         nan = jax.tree.map(lambda leaf: jnp.full_like(leaf, jnp.nan), learner.actor)
@@ -197,8 +210,7 @@ def test_a_seed_that_diverges_stops_alone(
     assert stored_steps(tmp_path / "b-s3") == []
     assert rows_of(tmp_path / "b-s3" / "metrics.csv") == []
     assert not (tmp_path / "b-s3" / "policy.npz").exists()
-    config = dataclasses.replace(stand_config, seed=5)
-    a, b = (stored(config, folder / "b-s5") for folder in (whole, tmp_path))
+    a, b = (stored(template, folder / "b-s5") for folder in (whole, tmp_path))
     assert_states(a, b, np.testing.assert_array_equal)
     assert (tmp_path / "b-s5" / "eval.csv").is_file()
 
@@ -220,17 +232,15 @@ def test_when_all_diverge_the_batch_ends(stand_config: TrainConfig, tmp_path: Pa
 
 
 def test_time_that_is_over_stops_and_saves(
-    stand_config: TrainConfig, whole: Path, tmp_path: Path
+    stand_config: TrainConfig, template: TrainState, tmp_path: Path
 ) -> None:
     with pytest.raises(pipeline.StoppedError, match="b-s3, b-s5 stopped at 0 transitions"):
         pipeline.run_seeds(
             stand_config, SEEDS, "debug", tmp_path, "b", lambda _: None, deadline=0.0
         )
     assert stored_steps(tmp_path / "b-s5") == [0]
-    train(stand_config, tmp_path)
-    config = dataclasses.replace(stand_config, seed=5)
-    a, b = (stored(config, folder / "b-s5") for folder in (whole, tmp_path))
-    assert_states(a, b, np.testing.assert_array_equal)
+    start = seeds.seed_state(seeds.init_seeds(stand_config, make_env(stand_config), SEEDS, None), 1)
+    assert_states(stored(template, tmp_path / "b-s5"), start, np.testing.assert_array_equal)
 
 
 def test_the_command_line_names_and_sources_every_seed(
