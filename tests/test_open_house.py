@@ -70,7 +70,7 @@ def test_a_task_of_ones_own_is_trained_evaluated_and_read_back(
     # The options are part of the run's identity.
     capsys.readouterr()
     assert cli.main([*command[:-2], "--variant", "scratch", "--trot.speed", "0.5", "--preset",
-                     "debug", "--runs", str(runs)]) == 2  # fmt: skip
+                     "debug", "--runs", str(runs), "--name", run_dir.name]) == 2  # fmt: skip
     assert "trot.speed: 0.8 -> 0.5" in capsys.readouterr().err
     # And evaluation, under a shift of one's own, finds the task by the run alone.
     out = tmp_path / "table.csv"

@@ -93,7 +93,7 @@ WORLDS = """
         "worlds",
     )
     odd = make_env(config, num_envs=3)
-    with pytest.raises(ValueError, match=r"env.num_envs is 3.*nearest: 4"):
+    with pytest.raises(ValueError, match=r"num_envs is 3.*nearest: 4"):
         sharding.ShardedEnv(odd, mesh)
     print("the same")
 """

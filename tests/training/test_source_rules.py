@@ -134,7 +134,7 @@ def test_files_that_no_run_wrote_are_left_alone(name: str, tmp_path: Path) -> No
     (tmp_path / name).write_bytes(b"mine")
     found = RunDir(tmp_path).status(make_config("biped", "debug"))
     assert isinstance(found, Foreign)
-    assert f"holds {name} and no config.json" in str(found.error)
+    assert f"holds {name} of a run and no config.json" in str(found.error)
     (tmp_path / name).rename(tmp_path / "notes.txt")
     assert RunDir(tmp_path).status(make_config("biped", "debug")) == New()
 

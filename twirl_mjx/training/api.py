@@ -99,12 +99,7 @@ def train(
     use_cache()
     registered = task if isinstance(task, str) else TASKS.register(task).name
     preset = preset or default_preset()
-    flat: dict[str, Any] = {}
-    for key, value in settings.items():
-        if isinstance(value, Mapping):
-            flat |= {f"{key}.{inner}": v for inner, v in value.items()}
-        else:
-            flat[key] = value
+    flat = _flat(settings)
     given = None
     if isinstance(source, str):
         flat["source"] = source
@@ -124,6 +119,17 @@ def train(
     )
     results = [_result(*each) for each in zip(run_dirs, configs, strict=True)]
     return results[0] if several is None else results
+
+
+def _flat(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Return settings by their public names, ``droq.utd`` for ``droq={"utd": ...}``."""
+    flat: dict[str, Any] = {}
+    for key, value in settings.items():
+        if isinstance(value, Mapping):
+            flat |= {f"{key}.{inner}": v for inner, v in value.items()}
+        else:
+            flat[key] = value
+    return flat
 
 
 def _result(run_dir: RunDir, config: TrainConfig) -> RunResult:

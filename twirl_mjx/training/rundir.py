@@ -208,7 +208,8 @@ class RunDir:
 
     def _work(self) -> list[Path]:
         """Return what there is of a run that cost something; a start that failed leaves nothing."""
-        work = [p for p in (self.dataset, self.policy, self.episodes) if p.exists()]
+        results = (self.dataset, self.policy, self.last_policy, self.episodes)
+        work = [path for path in results if path.exists()]
         if has_checkpoint(self.path):
             work.append(self.checkpoints)
         if self.metrics.exists() and not _is_header_only(self.metrics):

@@ -67,7 +67,7 @@ def shard_worlds(state: TrainState, mesh: Mesh) -> TrainState:
     Raises:
         ValueError: The number of worlds is not a multiple of the number of devices.
     """
-    _check_even("env.num_envs", state.env.reward.shape[0], mesh)
+    _check_even("num_envs", state.env.reward.shape[0], mesh)
     return jax.device_put(state, _named(_world_specs(), mesh))
 
 
@@ -99,7 +99,7 @@ class ShardedEnv(VectorEnv):
         Raises:
             ValueError: The number of worlds is not a multiple of the number of devices.
         """
-        _check_even("env.num_envs", env.num_envs, mesh)
+        _check_even("num_envs", env.num_envs, mesh)
         part = env.num_envs // mesh.size
 
         def make(num_envs: int) -> dict[str, Any]:
@@ -108,6 +108,8 @@ class ShardedEnv(VectorEnv):
                 "num_envs": num_envs,
                 "episode_length": env.episode_length,
                 "dynamics": dynamics,
+                "metric_names": env.metric_names,
+                "ranges": env.ranges,
             }
 
         super().__init__(env.task, env.scene, env.engine, **make(env.num_envs))
