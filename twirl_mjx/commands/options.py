@@ -102,7 +102,8 @@ def _parse[T: CollectOptions](argv: list[str], prog: str, options: type[T]) -> T
     found: Any = parse(kind, argv, prog, kind(preset, None, Path(known.runs), (), shown))
     values = {f.name: getattr(found.config, f.name) for f in dataclasses.fields(TrainConfig)}
     given: dict[str, Any] = {f.name: getattr(found, f.name) for f in dataclasses.fields(options)}
-    return options(**given | {"config": TrainConfig(**values)})
+    given["config"] = TrainConfig(**values)
+    return options(**given)
 
 
 def _shown(config: TrainConfig) -> TrainConfig:
