@@ -251,10 +251,10 @@ def test_the_command_line_names_and_sources_every_seed(
     folder = ["--runs", str(tmp_path), "--total-env-steps", "64"]
     assert cli.main([*command, *folder, "--seeds", "0", "1"]) == 0
     shown = capsys.readouterr().out
-    assert "biped-twirl-debug, seeds 0 1" in shown
+    assert "biped-twirl-debug-source_trot, seeds 0 1" in shown
     assert " each of 2 seeds" in shown
     for seed in (0, 1):
-        run_dir = RunDir(tmp_path / f"biped-twirl-debug-s{seed}")
+        run_dir = RunDir(tmp_path / f"biped-twirl-debug-s{seed}-source_trot")
         config = run_dir.read_config()
         assert config.seed == seed
         known = run_dir.read_source()

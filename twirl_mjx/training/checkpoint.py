@@ -118,7 +118,7 @@ class Checkpoints:
 
     def back_to(self, step: int) -> None:
         """Delete the checkpoints after ``step``, which is one of them."""
-        for later in [kept for kept in manifests.visible(self._root) if kept > step]:
+        for later in reversed([kept for kept in manifests.visible(self._root) if kept > step]):
             self._delete(later)
 
     def save(self, state: TrainState, progress: dict[str, Any]) -> None:
@@ -301,11 +301,6 @@ def _bare(state: TrainState) -> Any:
     return state.replay.online.replace(rows=jnp.zeros((0, 0), jnp.float32))
 
 
-def stored_steps(run_dir: Path) -> list[int]:
-    """Return the env steps of a run's checkpoints, oldest first; nothing is created."""
-    return manifests.visible((run_dir / "checkpoints").resolve())
-
-
 def has_checkpoint(run_dir: Path) -> bool:
     """Return whether a run can be resumed; nothing is created."""
     return newest_checkpoint(run_dir) is not None
@@ -314,6 +309,11 @@ def has_checkpoint(run_dir: Path) -> bool:
 def newest_checkpoint(run_dir: Path) -> int | None:
     """Return the env steps of a run's newest checkpoint, None without one; nothing is created."""
     return max(stored_steps(run_dir), default=None)
+
+
+def stored_steps(run_dir: Path) -> list[int]:
+    """Return the env steps of the checkpoints of a run, oldest first; nothing is created."""
+    return manifests.visible((run_dir / "checkpoints").resolve())
 
 
 def _open(run_dir: Path) -> tuple[ocp.CheckpointManager, int]:

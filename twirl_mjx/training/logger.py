@@ -32,9 +32,10 @@ class _Books:
         for sink in (table, TensorBoard()):
             sink.open(run)
             self.open.append(sink)
+        self.lacks = table.lacks
+        """What the table says is missing of it, if anything."""
         self.start = time.monotonic() - table.earlier_s
         """When the run would have begun, had it run without a pause."""
-        self.lacks = table.lacks
 
 
 class RunLogger:

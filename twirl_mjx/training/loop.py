@@ -117,7 +117,7 @@ class Batch:
         if len(self.runs) == 1:
             return self.runs[0].run_dir.name
         first = self.runs[0]
-        stem = first.run_dir.name.removesuffix(f"-s{first.config.seed}")
+        stem = "".join(first.run_dir.name.rsplit(f"-s{first.config.seed}", 1))
         return f"{stem}, seeds {' '.join(str(run.config.seed) for run in self.runs)}"
 
     def start(self) -> TrainState:
@@ -138,20 +138,21 @@ class Batch:
                 states = states.replace(learner=program.join(begun))
                 self.took_weights = True
         else:
-            template = self.program.template()
-            states = self.program.stack(self._restored(template, step))
+            states = self.program.stack(self._restore(step))
         return self.program.with_sources(states, [part.source for part in self._parts])
 
-    def _restored(self, template: TrainState, step: int) -> list[TrainState]:
-        """Return the checkpoints of all seeds at a step, at an earlier one if one is damaged."""
+    def _restore(self, step: int) -> list[TrainState]:
+        """Return the checkpoints of all seeds at ``step``, or before it where one is damaged."""
+        template = self.program.template()
         while True:
             states = [run.restore(template, step) for run in self.runs]
-            reached = min(int(state.env_steps) for state in states)
-            if reached == step:
+            reached = {int(state.env_steps) for state in states}
+            if len(reached) == 1:
                 return states
-            earlier = common_step({run.config.seed: run.run_dir for run in self.runs})
-            assert earlier is not None and earlier < step, "what was damaged has been deleted"
-            step = earlier
+            # Damaged ones have been deleted: the others go back to what is left in common.
+            found = common_step({run.config.seed: run.run_dir for run in self.runs})
+            assert found is not None, "every seed has restored one"
+            step = found
 
     def close(self) -> None:
         """Release the checkpoint managers."""
@@ -310,12 +311,12 @@ def train(
                 logger.announce(f"{why} at {steps:,} transitions; the same command resumes")
                 return [Outcome(False, steps, {})] * len(parts)
             with logger.aside("final evaluation ..."):
-                closing = final_evaluation(batch.live)
-            found = iter(closing)
-            each = [{} if run.fault else episode_means(next(found)) for run in batch.runs]
+                values = final_evaluation(batch.live)
+            closing = map(episode_means, values)
+            each = [{} if run.fault else next(closing) for run in batch.runs]
             logger.log(steps, grad_steps(states), by_name(FINAL, each))
-            for run, values in zip(batch.live, closing, strict=True):  # last: they are finished
-                run.run_dir.write_episodes(run.config, steps, values)
+            for run, measured in zip(batch.live, values, strict=True):  # last: it says "finished"
+                run.run_dir.write_episodes(run.config, steps, measured)
         if len(batch.live) < len(parts):
             raise batch.faults()
         return [Outcome(True, steps, means) for means in each]
@@ -326,9 +327,8 @@ def train(
 def final_evaluation(runs: Sequence[Run]) -> list[dict[str, np.ndarray]]:
     """Evaluate the best policy of every run on fresh seeds; return measures [E] of each."""
     config = runs[0].config
-    policies = [load_policy(run.run_dir.policy) for run in runs]
     actors: list[Any] = []
-    for policy in policies:
+    for policy in (load_policy(run.run_dir.policy) for run in runs):
         assert isinstance(policy, NumpyPolicy), "a run writes .npz policies"
         actors.append(jax.tree.map(jnp.asarray, dict(policy.actor_params)))
     evaluate = program.compile_evaluation(config, len(runs), config.eval.final_episodes)

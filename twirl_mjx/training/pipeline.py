@@ -251,7 +251,7 @@ def _train(members: list[Member], say: Say, deadline: float) -> None:
             zero_shot(member.config, member.run_dir, member.source, say)
         return
     begun = loop.common_step({member.config.seed: member.run_dir for member in members})
-    rings: dict[Path, ring.RingBuffer] = {}
+    rings: dict[str, ring.RingBuffer] = {}
     parts = []
     for member in members:
         config, run_dir, source = member.config, member.run_dir, member.source
@@ -261,8 +261,8 @@ def _train(members: list[Member], say: Say, deadline: float) -> None:
                 initial = source_weights(config, source, say)
             run_dir.open(config, source.identity)
             if config.uses_source_data:
-                replayed = config.shift != "none" and source.run_dir
-                place = replayed or run_dir.path  # one replay serves all seeds
+                found = source.data is not None or (config.shift != "none" and source.run_dir)
+                place = source.origin if found else str(run_dir)  # what is found serves all seeds
                 if place not in rings:
                     rings[place] = source_data(config, run_dir, source, say)
                 data = rings[place]
