@@ -271,7 +271,8 @@ def own_ways(source: str) -> tuple[int, list[str]]:
             continue
         called = ast.unparse(node.func)
         owner, _, name = called.rpartition(".")
-        opened += name == "open" and owner not in ("os", "Image", "run_dir", "sink")
+        of_a_thing = owner.rpartition(".")[2] in ("os", "Image", "run_dir", "sink")
+        opened += name == "open" and not of_a_thing
         if owner in ("files", "array_files"):
             continue
         in_memory = name == "savefig" and ast.unparse(node.args[0]) in ("file", "buffer")
