@@ -271,7 +271,7 @@ def own_ways(source: str) -> tuple[int, list[str]]:
             continue
         called = ast.unparse(node.func)
         owner, _, name = called.rpartition(".")
-        of_a_thing = owner.rpartition(".")[2] in ("os", "Image", "run_dir", "sink")
+        of_a_thing = owner.rpartition(".")[2] in ("os", "Image", "run_dir", "sink", "_terminal")
         opened += name == "open" and not of_a_thing
         if owner in ("files", "array_files"):
             continue
