@@ -11,11 +11,11 @@ from matplotlib.figure import Figure
 from twirl_mjx.figures.aggregate import statistics_of
 from twirl_mjx.figures.bars import ablation, shift_bars
 from twirl_mjx.figures.canvas import write_png
-from twirl_mjx.figures.cells import lead_metrics, ordered, shown_metrics
+from twirl_mjx.figures.cells import groups, lead_metrics, ordered, shown_metrics
 from twirl_mjx.figures.curves import learning_curves
 from twirl_mjx.figures.errors import TableError
 from twirl_mjx.figures.facts import read_facts
-from twirl_mjx.figures.tables import Table, read_directory
+from twirl_mjx.figures.tables import Table, mask, read_directory
 
 __all__ = ["Drawing", "ablation", "drawings", "learning_curves", "make_figures", "read_grids"]
 __all__ += ["shift_bars"]
@@ -73,7 +73,7 @@ def drawings(grid: str, curves: Table | None, episodes: Table | None) -> Iterato
     """Yield the figures of one grid: every measure that its rows hold.
 
     Curves with settings become one effect per setting that varies, other curves learning curves
-    and, where there are several shifts, bars; episodes become bars. What leads a task is drawn in
+    (of what is measured at two moments or more) and, where there are several shifts, bars; episodes become bars. What leads a task is drawn in
     the paper's style (mean and deviation) as well.
 
     Args:
@@ -96,6 +96,8 @@ def drawings(grid: str, curves: Table | None, episodes: Table | None) -> Iterato
         for kind, column in kinds:
             words = [start, kind, *([_slug(column)] if several else [])]
             for metric in metrics:
+                if kind == "curves" and metric not in leads and not _is_curve(table, metric):
+                    continue
                 shown = statistics_of(table.facts, metric)
                 for statistic in shown if metric in leads else shown[-1:]:
                     name = "_".join([*words, _slug(metric), statistic])
@@ -134,6 +136,12 @@ def _kinds(table: Table) -> list[tuple[str, str]]:
     if varied:
         return [("ablation", column) for column in varied]
     return [("curves", ""), *([("bars", "")] if len(ordered(table, "shift")) > 1 else [])]
+
+
+def _is_curve(table: Table, metric: str) -> bool:
+    """Return whether any run reports a metric at two moments, not at its close alone."""
+    rows = mask(table, table["metric"] == metric)
+    return any(len(set(run["env_steps"].tolist())) > 1 for run in groups(rows, ["run"]).values())
 
 
 def _drawing(
