@@ -73,8 +73,9 @@ def drawings(grid: str, curves: Table | None, episodes: Table | None) -> Iterato
     """Yield the figures of one grid: every measure that its rows hold.
 
     Curves with settings become one effect per setting that varies, other curves learning curves
-    (of what is measured at two moments or more) and, where there are several shifts, bars; episodes become bars. What leads a task is drawn in
-    the paper's style (mean and deviation) as well.
+    (of what is measured at two moments or more) and, where there are several shifts, bars;
+    episodes become bars. What leads a task is drawn in the paper's style (mean and deviation) as
+    well.
 
     Args:
         grid: Name of the grid.

@@ -139,7 +139,7 @@ class Batch:
                 self.took_weights = True
         else:
             states = self.program.stack(self._restore(step))
-        return self.program.with_sources(states, [part.source for part in self._parts])
+        return self.program.place(states, [part.source for part in self._parts])
 
     def _restore(self, step: int) -> list[TrainState]:
         """Return the checkpoints of all seeds at ``step``, or before it where one is damaged."""
@@ -165,7 +165,7 @@ class Batch:
         Returns:
             Mean measures by name, [S]; NaN where a measure is not defined, or a seed diverged.
         """
-        actors = states.learner.actor
+        actors = jax.device_put(states.learner.actor, jax.devices()[0])
         found = self.program.evaluate(actors, jax.random.key(self.config.eval.seed))
         counts = {"env_steps": int(states.env_steps), "grad_steps": grad_steps(states)}
         means = [
@@ -301,6 +301,8 @@ def train(
         with stop_on_signal() as stop, RunLogger(infos, sinks, name=batch.name) as logger:
             if steps:
                 logger.announce(f"resuming {batch.name} at {steps:,} transitions")
+            if batch.program.idle_devices:
+                logger.announce(batch.program.idle_devices)
             for run in batch.runs:
                 if run.checkpoints.stepped_over:
                     logger.announce(run.checkpoints.stepped_over)
