@@ -177,7 +177,8 @@ class Registry[T]:
         if name not in self._items and (point := self._entry_points().get(name)) is not None:
             self._add(point.load(), point.value)
             self._references.pop(name, None)  # it is found by its name, in every process
-        check_choice(self.kind, name, self.names())
+        if name not in self._items:
+            check_choice(self.kind, name, self.names())
         return self._items[name]
 
     def names(self) -> tuple[str, ...]:
