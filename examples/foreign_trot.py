@@ -90,11 +90,12 @@ def learn(contract: Contract) -> list[dict[str, np.ndarray]]:
     obs, answer = (jnp.asarray(array, jnp.float32) for array in lessons(contract))
     sizes = [(obs.shape[1], UNITS), (UNITS, UNITS), (UNITS, 12)]
     keys = jax.random.split(jax.random.key(0), 3)
-    used = 15.0 / obs.shape[1]  # most inputs are zero: command and last output have 15 numbers
+    used = jnp.any(obs != 0.0, axis=0)  # it is deaf to the rest: command and last output only
     weights = [
-        {"w": jax.random.normal(key, size) / np.sqrt(size[0] * shown), "b": jnp.zeros(size[1])}
-        for key, size, shown in zip(keys, sizes, (used, 1.0, 1.0), strict=True)
+        {"w": jax.random.normal(key, size) / jnp.sqrt(size[0]), "b": jnp.zeros(size[1])}
+        for key, size in zip(keys, sizes, strict=True)
     ]
+    weights[0]["w"] *= jnp.sqrt(obs.shape[1] / used.sum()) * used[:, None]
     adam = optax.adam(optax.cosine_decay_schedule(LEARNING_RATE, UPDATES))
 
     def update(carry: tuple, key: jax.Array) -> tuple[tuple, None]:

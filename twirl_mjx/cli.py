@@ -34,7 +34,7 @@ COMMANDS = {
     "curriculum": "train the chain of tasks one after another",
 }
 """Command name to its one-line description; each lives in ``twirl_mjx.commands.<name>``."""
-DRAWING = ("render", "demo", "clip")
+DRAWING = ("render", "demo", "clip", "rehearse")
 """Commands that may draw the robot; they say so to :func:`set_up` once they know."""
 
 

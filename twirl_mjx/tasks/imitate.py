@@ -173,6 +173,8 @@ class ImitateObserver:
         self.layout = make_layout(clip.robot)
         self.control_dt = clip.robot.control_dt
         """s, control step."""
+        self.motion = clip
+        """The clip itself."""
         self.clip = clip.to_arrays()
         self.duration = clip.cycle_duration
         """s, length of a cycle."""

@@ -13,6 +13,7 @@ import numpy as np
 
 from twirl_mjx.policies.learned import PolicyHeader, save_policy
 from twirl_mjx.replay.ring import RingBuffer
+from twirl_mjx.sim.robots import ROBOTS
 from twirl_mjx.tasks.measures import episode_means, measures_of
 from twirl_mjx.tasks.observations import layout_slices
 from twirl_mjx.training import config_json, rundir
@@ -135,6 +136,7 @@ class Run:
             "replay_ratio": self.replay_ratio,
             "wall_s": round(self.progress["wall_s"], 1),
             "options": dataclasses.asdict(self.config.options),
+            "robot": ROBOTS.reference(self.config.robot) or self.config.robot,
             "evaluation": means,
         }
         header = make_header(self.config, self._env, card)
