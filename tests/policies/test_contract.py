@@ -116,7 +116,10 @@ FAULTS: list[tuple[dict[str, Any], str]] = [
     ({"observation": [{"name": "target_joint_pos", "size": 12}]}, "needs a motion, and there is"),
     ({"observation": [{"name": "joint_pos", "size": 12, "ahead": 2}]}, "ahead = 2 is outside"),
     ({"motion": {"frame_dt": 0.02, "frames": [[0.0] * 19]}}, "has 1 frames, need at least 2"),
-    ({"motion": {"frame_dt": 0.02, "frames": [[0.0] * 7] * 2}}, r"frames\[0\] has 7 numbers for 19"),
+    (
+        {"motion": {"frame_dt": 0.02, "frames": [[0.0] * 7] * 2}},
+        r"frames\[0\] has 7 numbers for 19",
+    ),
     ({"motion": {"frame_dt": 0.02, "frames": 3}}, "frames = 3 is int"),
 ]
 

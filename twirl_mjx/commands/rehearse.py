@@ -139,7 +139,8 @@ def print_table(policy: str, result: Rehearsal) -> None:
     from rich.table import Table
 
     count = len(result.episodes)
-    table = Table(title=f"{policy} rehearsed in {result.task}, {count} episodes", box=SIMPLE)
+    say(f"{policy} rehearsed in {result.task}, {count} episode{'s' * (count > 1)}")
+    table = Table(box=SIMPLE)
     table.add_column("metric", overflow="fold")
     for column in ("mean", "95 % from", "to", "unit"):
         table.add_column(column, justify="left" if column == "unit" else "right")

@@ -206,7 +206,7 @@ def run_episode(
     score.start(data.qpos[:3], score.goal(drawn))
     reading = sensors.read(data)
     pilot.reset(reading)
-    command = CommandFilter(data.qpos[7:])
+    command = CommandFilter(reading.joint_pos)  # a robot knows what it measures
     targets = deque([(0, data.qpos[7:].copy())])
     feet = [model.geom(name).id for name in FEET]
     radii = model.geom_size[feet, 0]

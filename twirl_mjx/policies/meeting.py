@@ -10,6 +10,7 @@ step of the worlds, whatever its own rate; its clocks count its own steps.
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -155,7 +156,7 @@ class Seen:
     ahead: int = 0
     """Control steps from now, for what is shown of the motion."""
 
-    @property
+    @functools.cached_property
     def target(self) -> jax.Array:
         """[N, 7 + J] the motion, joints in the robot's order."""
         assert self.reference is not None, "a contract with such words has a motion"
@@ -321,12 +322,14 @@ class ContractPolicy:
             reference=self._reference,
             offset=self._offset(memory, state),
         )
+        times = {term.ahead for term in contract.observation}
+        at = {ahead: dataclasses.replace(seen, ahead=ahead) for ahead in times}
         now, history = [], []
         for term in contract.observation:
             zeros = jnp.zeros((len(qpos), term.size))
             value = zeros
             if term.name != "constant":
-                value = FILL[term.name](dataclasses.replace(seen, ahead=term.ahead))
+                value = FILL[term.name](at[term.ahead])
             value = jnp.asarray(term.scale, jnp.float32) * (
                 value - jnp.asarray(term.offset, jnp.float32)
             )

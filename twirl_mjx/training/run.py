@@ -80,7 +80,13 @@ class Run:
         self.resumed_at: int | None = None
         self.fault: DivergedError | None = None
         """Why this seed goes on no more, although others may."""
-        self.progress: dict[str, Any] = {"best": -math.inf, "wall_s": 0.0, "inserted": 0}
+        self.progress: dict[str, Any] = {
+            "best": -math.inf,
+            "wall_s": 0.0,
+            "inserted": 0,
+            "first_drop": "",
+        }
+        """What a checkpoint holds beside the state; ``first_drop``: why, empty if none was."""
         self._env = env
         self._stage = stage
 
