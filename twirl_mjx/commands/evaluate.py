@@ -67,6 +67,8 @@ class EvaluateOptions:
     """What foreign policies are told to do: 0.5,0,0 or towards-goal:0.5."""
     allow_clipping: bool = False
     """Score foreign policies without a contract although their outputs leave [-1, 1]."""
+    overwrite: bool = False
+    """Replace a table or a figure that this command did not write."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -96,7 +98,7 @@ def main(argv: list[str]) -> int:
     if twice := [name for name in options.shifts if options.shifts.count(name) > 1]:
         raise ValueError(f"--shifts names {twice[0]} twice: once is enough")
     out = options.out or Path("runs", f"evaluation-{time.strftime('%Y%m%d-%H%M%S')}.csv")
-    check_outputs(out, options.figure)
+    check_outputs(out, options.figure, options.overwrite)
     candidates = resolve_all(options, overrides)
     rows: list[list[object]] = []
     for candidate in candidates:
@@ -108,19 +110,25 @@ def main(argv: list[str]) -> int:
     return 0
 
 
-def check_outputs(out: Path, figure: Path | None) -> None:
+def check_outputs(out: Path, figure: Path | None, overwrite: bool = False) -> None:
     """Check where results go before anything is evaluated.
 
     Raises:
-        ValueError: A folder or a device where a file is meant, or a figure that is no PNG.
+        ValueError: A folder or a device where a file is meant, a figure that is no PNG, or a file
+            that this command did not write.
     """
+    from twirl_mjx.training.rundir import EVAL_COLUMNS
+
     if out.is_dir():
         raise ValueError(f"--out {out} is a folder (nearest: {out / 'evaluation.csv'})")
-    files.check_target(out)
-    if figure is not None and (figure.is_dir() or figure.suffix != ".png"):
+    files.check_ours(out, ",".join(EVAL_COLUMNS), overwrite=overwrite)
+    if figure is None:
+        return
+    if figure.is_dir() or figure.suffix != ".png":
         raise ValueError(
             f"--figure {figure} is no PNG file (nearest: {figure.with_suffix('.png')})"
         )
+    files.check_ours(figure, overwrite=overwrite)
 
 
 def resolve_all(options: EvaluateOptions, overrides: Overrides) -> list[Candidate]:
