@@ -120,6 +120,7 @@ def make_figures(
         results_dir: ``experiments/results``, with ``<grid>/<arm>.csv`` below it.
         output_dir: Directory of the pictures, made if needed.
         say: Called with one line per grid that is left out.
+        overwrite: Whether pictures may be replaced that this did not write.
 
     Returns:
         The files written, ``<output_dir>/<grid>_<kind>_<metric>_<statistic>.png``.
