@@ -58,6 +58,10 @@ def test_evaluate(graph: str) -> None:
     )
     (candidate,) = evaluate.resolve_all(options, {})
     check(candidate.found.policy)
+    both = dataclasses.replace(options, policies=("zero", graph))
+    check(evaluate.resolve_all(both, {})[1].found.policy)
+    with pytest.raises(ValueError, match="would do nothing: zero is scripted"):
+        evaluate.resolve_all(dataclasses.replace(options, policies=("zero",)), {})
 
 
 def test_render(graph: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

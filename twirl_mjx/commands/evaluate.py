@@ -139,9 +139,10 @@ def resolve_all(options: EvaluateOptions, overrides: Overrides) -> list[Candidat
         ValueError: A file that is no policy, options of another task, or two policies that the
             table could not tell apart.
     """
-    from twirl_mjx.policies.resolve import Terms, resolve_policy
+    from twirl_mjx.policies.resolve import PLAIN, Terms, resolve_policy, takes_terms
 
     terms = Terms(options.source_contract, options.source_command, options.allow_clipping)
+    foreign = [given for given in options.policies if terms != PLAIN and takes_terms(given)]
     candidates: dict[str, Candidate] = {}
     for given in options.policies:
         run = name_of(given)
@@ -153,7 +154,8 @@ def resolve_all(options: EvaluateOptions, overrides: Overrides) -> list[Candidat
         config = with_overrides(config_of(given, options.task), overrides)
         config = dataclasses.replace(config, course=options.course, engine=options.engine)
         config.make_task()  # refuses options that only the task can judge
-        found = resolve_policy(given, config, terms=terms)
+        its = terms if given in foreign or not foreign else PLAIN  # refused where nobody is foreign
+        found = resolve_policy(given, config, terms=its)
         if found.data is not None:
             raise ValueError(
                 f"{given} is recorded data, which does not act (nearest: the policy behind it)"

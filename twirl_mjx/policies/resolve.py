@@ -226,6 +226,18 @@ def header_of(name: str) -> PolicyHeader | None:
     return load_policy(path).header
 
 
+def takes_terms(name: str) -> bool:
+    """Return whether a contract or a command can mean anything to a source.
+
+    Raises:
+        FileNotFoundError: Nothing to load there.
+        PolicyFileError: The file is no policy.
+    """
+    if name in SCRIPTED_SOURCES or recorded.is_recording(Path(name)):
+        return False
+    return header_of(name) is None
+
+
 def _digest(path: Path, header: PolicyHeader | None) -> str:
     if path.is_dir() and header is not None:
         return f"{header.config_digest}@{header.card.get('env_steps')}"

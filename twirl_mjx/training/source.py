@@ -67,11 +67,7 @@ def collect(
         kept, dropped = kept + int(valid.sum()), dropped + int((~valid).sum())
         for name, value in (values | {"episodes": jnp.ones_like(values["return"])}).items():
             sums[name] = sums.get(name, 0.0) + float(np.asarray(value)[ended].sum())
-        if dropped > MAX_DROPPED * size:
-            raise DivergedError(
-                f"{dropped:,} of {kept + dropped:,} steps of the source were dropped, more than"
-                f" {MAX_DROPPED:.0%} of the {size:,} that are wanted; the first one because {cause}"
-            )
+        check_dropped(dropped, kept, size, cause)
         check_clipped(outside / max(kept, 1), max_clipped)
     episodes = sums.pop("episodes")
     means = {name: value / episodes for name, value in sums.items()} if episodes else {}
@@ -79,6 +75,19 @@ def collect(
         means["clipped"] = outside / kept
     data = jax.tree.map(lambda *parts: np.concatenate(parts)[:size], *rows)
     return data, means
+
+
+def check_dropped(dropped: int, kept: int, size: int, cause: str) -> None:
+    """Refuse a recording of which too much was dropped.
+
+    Raises:
+        DivergedError: More than ``MAX_DROPPED`` of the ``size`` steps that are wanted.
+    """
+    if dropped > MAX_DROPPED * size:
+        raise DivergedError(
+            f"{dropped:,} of {kept + dropped:,} steps of the source were dropped, more than"
+            f" {MAX_DROPPED:.0%} of the {size:,} that are wanted; the first one because {cause}"
+        )
 
 
 def check_clipped(share: float, limit: float) -> None:
