@@ -82,6 +82,14 @@ def test_nothing_of_others_is_replaced(tmp_path: Path) -> None:
         run("zero", "--task", "biped", "--film", str(tmp_path / "f.mp4"))
 
 
+def test_a_film_of_the_first_episode(tmp_path: Path) -> None:
+    film = tmp_path / "hurdles.mp4"
+    words = ["zero", "--task", "hurdles", "--episodes", "1", "--film", str(film)]
+    assert run(*words) == 0
+    files.check_ours(film)
+    files.check_ours(film.with_suffix(".png"))
+
+
 def test_recorded_data_do_not_act(tmp_path: Path) -> None:
     np.savez(tmp_path / "d.npz", obs=np.zeros((2, 101)), action=np.zeros((2, 12)))
     with pytest.raises(ValueError, match=r"d\.npz"):

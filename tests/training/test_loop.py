@@ -24,6 +24,7 @@ from twirl_mjx.training.config import TrainConfig
 from twirl_mjx.training.presets import make_config
 from twirl_mjx.training.run import Part
 from twirl_mjx.training.rundir import RunDir
+from twirl_mjx.training.source import check_dropped
 from twirl_mjx.training.state import TrainState
 from twirl_mjx.worlds.make import make_env
 from twirl_mjx.worlds.vector import FAULTS
@@ -200,6 +201,12 @@ def test_worlds_that_only_diverge_stop_the_run() -> None:
         guards.check_experience(4_899, 5_000, 10_000, "the reward was not finite")
 
 
+def test_a_recording_that_drops_too_much_is_refused() -> None:
+    check_dropped(1, 99, 100, "the action was not finite")
+    with pytest.raises(guards.DivergedError, match=r"^2 of 60 steps .* because the action was"):
+        check_dropped(2, 58, 100, "the action was not finite")
+
+
 def test_a_run_that_drops_too_much_fails_with_count_and_first_cause(
     stand_config: TrainConfig, whole_run: Path
 ) -> None:
@@ -308,7 +315,9 @@ def test_source_data_are_required(tmp_path: Path) -> None:
     assert not (tmp_path / "x").exists()
 
 
-def test_non_finite_world_never_reaches_the_ring(stand_config: TrainConfig) -> None:
+def test_non_finite_world_never_reaches_the_ring(
+    stand_config: TrainConfig, capfd: pytest.CaptureFixture[str]
+) -> None:
     env = make_env(stand_config)
     train_state = state.init(stand_config, env, jax.random.key(0), None)
     data = train_state.env.data
@@ -323,3 +332,4 @@ def test_non_finite_world_never_reaches_the_ring(stand_config: TrainConfig) -> N
     rows = ring.gather(after.replay.online, jnp.arange(4))
     assert np.isfinite(np.asarray(rows.next_obs)).all()
     assert np.isfinite(np.asarray(result.obs)).all()
+    assert "WARNING" not in "".join(capfd.readouterr())  # MuJoCo's own words

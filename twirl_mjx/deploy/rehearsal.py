@@ -23,6 +23,7 @@ from twirl_mjx.deploy.reference import Reading, Score
 from twirl_mjx.deploy.robot import CommandFilter, Contacts, Sensors, build_model, motor_torque
 from twirl_mjx.figures import statistics
 from twirl_mjx.policies.resolve import PLAIN, Terms
+from twirl_mjx.sim.engine import silence
 
 __all__ = ["IDEAL", "Episode", "Rehearsal", "RehearsalConfig", "Row", "rehearse"]
 
@@ -297,6 +298,7 @@ def rehearse(
     """
     if episodes < 1:
         raise ValueError(f"episodes must be at least 1, got {episodes}")
+    silence()
     pilot, task = find_pilot(policy, task, options, terms, say)
     config = config or RehearsalConfig()
     results = [
