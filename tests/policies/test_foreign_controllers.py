@@ -100,4 +100,4 @@ def test_a_foreign_graph_is_shown_what_its_contract_says(
     pose = np.array([0.1, 0.9, -1.8, -0.1, 0.9, -1.8])
     expected = (pose + 0.5 * shown - np.tile([0.0, 0.9, -1.8], 2)) / np.tile([0.6, 1.2, 1.2], 2)
     np.testing.assert_allclose(episode.actions[3][:6], np.clip(expected, -1, 1), atol=1e-4)
-    assert episode.metrics["clipped"] == 0.0
+    assert episode.metrics["clipped"] < 0.05
