@@ -49,6 +49,8 @@ def test_a_scripted_source_does_what_its_numpy_form_does() -> None:
     numpy = rehearse(ClockedGait(TROT), task="hurdles", episodes=1, config=QUICK).episodes[0]
     np.testing.assert_allclose(named.actions, numpy.actions, atol=1e-6)
     np.testing.assert_allclose(named.qpos, numpy.qpos, atol=1e-4)
+    noise = rehearse("random", task="hurdles", episodes=1, config=QUICK).episodes[0].actions
+    assert np.ptp(noise, axis=0).min() > 0.1
 
 
 @pytest.mark.parametrize(

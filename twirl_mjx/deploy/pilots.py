@@ -89,9 +89,12 @@ class SourcePilot(OwnPilot):
     def __init__(self, policy: SourcePolicy, task: str, options: Any) -> None:
         """Compile the policy for one robot."""
         super().__init__(policy, task, options)
-        self._act = jax.jit(
-            lambda memory, seen: policy.act(memory, _state(seen), jax.random.key(0))
-        )
+
+        def act(memory: Any, seen: dict[str, jax.Array]) -> tuple[jax.Array, Any]:
+            key = jax.random.fold_in(jax.random.key(0), seen["step"][0])
+            return policy.act(memory, _state(seen), key)
+
+        self._act = jax.jit(act)
 
     def reset(self, reading: Reading) -> None:
         """Begin an episode."""
