@@ -57,13 +57,13 @@ def hash_bits(seed: jax.Array, num: int) -> jax.Array:
 
 
 def keep_mask(seed: jax.Array, shape: tuple[int, int, int], rate: float) -> jax.Array:
-    """Return the bool mask [E, B, H] of the elements to keep.
+    """Return the bool mask of the elements to keep, in the shape that is given.
 
     One hash serves two ensemble members: its low half the even one, its high half the odd one.
 
     Args:
         seed: [2] uint32.
-        shape: Ensemble members E, rows B, units H.
+        shape: Ensemble members E first, then rows and units in either order.
         rate: Probability of dropping an element, rounded to a multiple of 1 / RESOLUTION.
     """
     num_critics, rows, units = shape
