@@ -10,6 +10,7 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
+from twirl_mjx.droq import dropout
 from twirl_mjx.droq.hoisted import Layout
 from twirl_mjx.droq.networks import LAYER_NORM_EPSILON, dot_general
 from twirl_mjx.droq.packing import PackedCritic
@@ -54,6 +55,7 @@ LAYOUT = Layout(
     restore=_as_packed,
     inputs=_rows,
     shape=lambda critics, rows, units: (critics, rows, units),
+    mask=dropout.keep_mask_by_element,
     first=_first,
     dense=_dense,
     norm=_norm,

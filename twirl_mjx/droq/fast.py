@@ -9,7 +9,7 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
-from twirl_mjx.droq import fused
+from twirl_mjx.droq import dropout, fused
 from twirl_mjx.droq.hoisted import Layout
 from twirl_mjx.droq.packing import PackedCritic
 
@@ -46,6 +46,7 @@ LAYOUT = Layout(
     restore=_restore,
     inputs=_columns,
     shape=lambda critics, rows, units: (critics, units, rows),
+    mask=dropout.keep_mask,
     first=_first,
     dense=_dense,
     norm=fused.dropout_norm_relu,

@@ -52,6 +52,8 @@ class Layout:
     (it meets the biases)."""
     shape: Callable[[int, int, int], tuple[int, int, int]]
     """Return the shape of activations of E critics, B rows and H units."""
+    mask: Callable[[jax.Array, tuple[int, int, int], float], jax.Array]
+    """Return a keep mask of (hash seed [2], shape, rate)."""
     first: Callable[[jax.Array, jax.Array, int, str], jax.Array]
     """Return kernel 0 times the inputs of one minibatch, for E critics, in a ``matmul_dtype``."""
     dense: Callable[[jax.Array, jax.Array, jax.Array, str], jax.Array]
@@ -64,9 +66,7 @@ class Layout:
     def masks(self, seeds: jax.Array, rows: int, config: DroqConfig) -> list[jax.Array]:
         """Return the keep masks of all hidden layers from hash seeds [layers, 2]."""
         return [
-            dropout.keep_mask(
-                seeds[i], self.shape(config.num_critics, rows, size), config.dropout_rate
-            )
+            self.mask(seeds[i], self.shape(config.num_critics, rows, size), config.dropout_rate)
             for i, size in enumerate(config.hidden_sizes)
         ]
 
@@ -138,14 +138,15 @@ class Layout:
             minibatches.terminated,
             next_log_prob,
             dropout.seeds(key, (num_steps, 2, len(config.hidden_sizes))),
+            _bias_corrections(state.critic_opt.count, num_steps, config.learning_rate),
         )
         moments = cast(tuple[Params, Params], (state.critic_opt.mu, state.critic_opt.nu))
         trees = (state.critic, state.target_critic, *moments)
         packed = tuple(self.arrange(packing.pack(tree, config.hidden_sizes)) for tree in trees)
 
         def body(carry: tuple, step: tuple) -> tuple[tuple, tuple]:
-            (critic, target_critic, mu, nu), count = carry
-            inputs, next_inputs, reward, terminated, log_prob, seeds = step
+            critic, target_critic, mu, nu = carry
+            inputs, next_inputs, reward, terminated, log_prob, seeds, corrections = step
             masks = [self.masks(seeds[i], rows, config) for i in range(2)]
             vectors = packing.split_vectors(target_critic.vectors, config.hidden_sizes)
             next_q = self.ensemble_q(target_critic.kernels, vectors, next_inputs, masks[1], config)
@@ -153,12 +154,11 @@ class Layout:
                 reward, terminated, next_q, log_prob, temperature, config.discount
             )
             q, grad = self.critic_gradient(critic, inputs, target, masks[0], config)
-            count = count + 1
-            packed = _adam_polyak(critic, target_critic, mu, nu, grad, count, config)
-            return (packed, count), (q, target, squared_norm(grad))
+            packed = _adam_polyak(critic, target_critic, mu, nu, grad, corrections, config.tau)
+            return packed, (q, target, squared_norm(grad))
 
-        carry = (packed, state.critic_opt.count)
-        (packed, count), (q, target, squares) = jax.lax.scan(body, carry, xs)
+        packed, (q, target, squares) = jax.lax.scan(body, packed, xs)
+        count = state.critic_opt.count + num_steps
         critic, target_critic, mu, nu = (
             packing.unpack(self.restore(p), config.hidden_sizes) for p in packed
         )
@@ -197,19 +197,28 @@ class Layout:
         return q, PackedCritic(kernels=grads[0], vectors=jnp.concatenate(grads[1], axis=1))
 
 
+def _bias_corrections(
+    count: jax.Array, num_steps: int, learning_rate: float
+) -> tuple[jax.Array, jax.Array]:
+    """Return what Adam's bias corrections come to in U steps after ``count``, [U] each.
+
+    The step size over 1 - beta_1^t, and 1 / sqrt(1 - beta_2^t).
+    """
+    step = (count + 1 + jnp.arange(num_steps)).astype(jnp.float32)
+    return learning_rate / (1.0 - ADAM_B1**step), jax.lax.rsqrt(1.0 - ADAM_B2**step)
+
+
 def _adam_polyak(
     critic: PackedCritic,
     target_critic: PackedCritic,
     mu: PackedCritic,
     nu: PackedCritic,
     grad: PackedCritic,
-    count: jax.Array,
-    config: DroqConfig,
+    corrections: tuple[jax.Array, jax.Array],
+    tau: float,
 ) -> tuple[PackedCritic, PackedCritic, PackedCritic, PackedCritic]:
-    """Take one Adam step (bias corrections folded into two scalars), then one Polyak step."""
-    step = count.astype(jnp.float32)
-    step_size = config.learning_rate / (1.0 - ADAM_B1**step)
-    root_scale = jax.lax.rsqrt(1.0 - ADAM_B2**step)
+    """Take one Adam step with the two scalars of ``_bias_corrections``, then one Polyak step."""
+    step_size, root_scale = corrections
 
     def move(p: jax.Array, m: jax.Array, n: jax.Array) -> jax.Array:
         return p - step_size * m / (jnp.sqrt(n) * root_scale + ADAM_EPSILON)
@@ -217,5 +226,5 @@ def _adam_polyak(
     mu = jax.tree.map(lambda m, g: ADAM_B1 * m + (1.0 - ADAM_B1) * g, mu, grad)
     nu = jax.tree.map(lambda n, g: ADAM_B2 * n + (1.0 - ADAM_B2) * jnp.square(g), nu, grad)
     critic = jax.tree.map(move, critic, mu, nu)
-    target_critic = jax.tree.map(lambda t, p: t + config.tau * (p - t), target_critic, critic)
+    target_critic = jax.tree.map(lambda t, p: t + tau * (p - t), target_critic, critic)
     return critic, target_critic, mu, nu
