@@ -130,7 +130,7 @@ def test_table_shows_what_a_folder_holds(tmp_path: Path) -> None:
     assert "| mjx, worlds 8 | - | u | - | status 1 |" in text
     assert "| learner.fast | critic | 2.0e-03 | 1e-03 | no |" in text
     assert "| native | qpos | 1.0e-06 | 1e-03 | yes |" in text
-    assert "| 0 | 6,400 | 3,200 | 61 | 812 | 31.0 |" in text
+    assert "| 0 | 6,400 | 3,200 | 61 | 812 | 31 |" in text
 
 
 @pytest.mark.slow

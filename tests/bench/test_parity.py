@@ -47,6 +47,7 @@ def test_a_command_that_fails_is_told(tmp_path: Path, monkeypatch: pytest.Monkey
         parity.write(tmp_path / "x.npz", environment)
 
 
+@pytest.mark.slow
 def test_learner_numbers_move_and_are_complete() -> None:
     found = parity.learner_numbers()
     for form in ("plain", "fast", "accelerator"):

