@@ -123,7 +123,7 @@ def learner_program(program: str, form: str, seeds: int) -> Task:
     """Return a block of critic updates, or a whole update, of one learner or of several."""
     config = DroqConfig(**forms.settings_of(form))
 
-    def spec(*shape: int, dtype: Any = jnp.float32) -> jax.ShapeDtypeStruct:
+    def spec(*shape: int, dtype: Any = jnp.float32) -> Any:
         return jax.ShapeDtypeStruct(shape, dtype)
 
     minibatches = Transition(

@@ -170,16 +170,23 @@ def environment() -> dict[str, str]:
 
 
 def find_machine(limit: float) -> Record:
-    """Return ``measure.machine()`` of a process of its own: this one leaves the GPU alone."""
+    """Return ``measure.machine()`` of a process of its own: this one leaves the GPU alone.
+
+    Raises:
+        RuntimeError: jax found no device, or not in time.
+    """
     code = "import json; from twirl_mjx.bench.measure import machine; print(json.dumps(machine()))"
-    done = subprocess.run(
-        [sys.executable, "-c", code],
-        env={**os.environ, **environment()},
-        capture_output=True,
-        text=True,
-        timeout=max(1.0, limit),
-        check=False,
-    )
+    try:
+        done = subprocess.run(
+            [sys.executable, "-c", code],
+            env={**os.environ, **environment()},
+            capture_output=True,
+            text=True,
+            timeout=max(1.0, limit),
+            check=False,
+        )
+    except subprocess.TimeoutExpired:
+        raise RuntimeError(f"jax found no device in {limit:.0f} s (--minutes)") from None
     if done.returncode:
         raise RuntimeError(f"jax found no device: {done.stderr.strip()[-300:]}")
     return json.loads(done.stdout.splitlines()[-1])

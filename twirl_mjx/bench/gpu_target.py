@@ -155,7 +155,7 @@ def compile_for(
         if not found:
             raise RuntimeError("XLA's GPU compiler left no list of operations (--xla_dump_to)")
         loops = thunks.parse(files.read_text(found[-1], "a list of GPU operations"))
-    memory = compiled.memory_analysis()
+    memory: Any = compiled.memory_analysis()
     return Compiled(
         loops,
         seconds,

@@ -68,7 +68,8 @@ class Worker:
     def __exit__(self, *_: object) -> None:
         # Closing its input ends a waiting worker; a busy one is ended.
         assert self._process.stdin is not None
-        self._process.stdin.close()
+        with contextlib.suppress(BrokenPipeError):  # it ended before it read what it was sent
+            self._process.stdin.close()
         try:
             self._process.wait(timeout=10)
         except subprocess.TimeoutExpired:

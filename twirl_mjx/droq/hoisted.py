@@ -131,6 +131,7 @@ class Layout:
         next_action, next_log_prob = act(
             actor, minibatches.next_obs, next_noise, config.matmul_dtype
         )
+        done = cast(jax.Array, state.critic_opt.count)
         xs = (
             self.inputs(minibatches.obs, minibatches.action),
             self.inputs(minibatches.next_obs, next_action),
@@ -138,7 +139,7 @@ class Layout:
             minibatches.terminated,
             next_log_prob,
             dropout.seeds(key, (num_steps, 2, len(config.hidden_sizes))),
-            _bias_corrections(state.critic_opt.count, num_steps, config.learning_rate),
+            _bias_corrections(done, num_steps, config.learning_rate),
         )
         moments = cast(tuple[Params, Params], (state.critic_opt.mu, state.critic_opt.nu))
         trees = (state.critic, state.target_critic, *moments)
@@ -158,7 +159,6 @@ class Layout:
             return packed, (q, target, squared_norm(grad))
 
         packed, (q, target, squares) = jax.lax.scan(body, packed, xs)
-        count = state.critic_opt.count + num_steps
         critic, target_critic, mu, nu = (
             packing.unpack(self.restore(p), config.hidden_sizes) for p in packed
         )
@@ -168,7 +168,7 @@ class Layout:
             "target_q_mean": jnp.mean(target),
             "critic_grad_norm": jnp.mean(jnp.sqrt(squares)),
         }
-        return CriticState(critic, target_critic, AdamState(count, mu, nu)), metrics
+        return CriticState(critic, target_critic, AdamState(done + num_steps, mu, nu)), metrics
 
     def critic_gradient(
         self,
