@@ -94,7 +94,7 @@ PROGRAM = """
     from twirl_mjx import cli
     from twirl_mjx.training.program import Program
 
-    words = "train --task stand --preset debug --variant scratch --num-envs 4 --eval.episodes 2"
+    words = "train --task stand --preset debug --variant scratch --num-envs 4"
     words += " --droq.hidden-sizes 32 --warmup-env-steps 64 --epoch-env-steps 64 --runs FOLDER"
     for count in (1, 2, 3):
         chosen = ["--name", f"run{count}", "--seeds", *map(str, range(count))]
@@ -113,7 +113,7 @@ def run_child(body: str, engine: str, error: float) -> str:
     """
     code = textwrap.dedent(CHILD) + textwrap.dedent(body)
     child = dict(os.environ)
-    child["XLA_FLAGS"] = "--xla_force_host_platform_device_count=2"
+    child["XLA_FLAGS"] += " --xla_force_host_platform_device_count=2"  # conftest has set it
     done = subprocess.run(
         [sys.executable, "-c", code.replace("ENGINE", engine).replace("ERROR", str(error))],
         env=child,

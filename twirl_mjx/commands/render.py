@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import numpy as np
 import tyro
 
+from twirl_mjx import files
 from twirl_mjx.checks import check_range
 from twirl_mjx.commands.console import say
 from twirl_mjx.plugins import is_reference
@@ -50,6 +51,8 @@ class RenderOptions:
     """What a foreign policy is told to do: 0.5,0,0 or towards-goal:0.5."""
     allow_clipping: bool = False
     """Show a foreign policy without a contract although its outputs leave [-1, 1]."""
+    overwrite: bool = False
+    """Replace a film or a strip that this command did not write."""
 
     def __post_init__(self) -> None:
         """Check the numbers.
@@ -83,7 +86,13 @@ def main(argv: list[str], set_up: Callable[[bool], None]) -> int:
 
 
 def film(config: WorldConfig, options: RenderOptions, stem: Path) -> Path:
-    """Write ``<stem>.mp4`` and ``<stem>.png``; return the strip's path."""
+    """Write ``<stem>.mp4`` and ``<stem>.png``; return the strip's path.
+
+    Raises:
+        FileError: One of them is there and was not written by this project.
+    """
+    for ending in (".mp4", ".png"):
+        files.check_ours(stem.parent / f"{stem.name}{ending}", overwrite=options.overwrite)
     from twirl_mjx.deploy.render import render_episode
     from twirl_mjx.evaluation.record import record_episode, scene_model
     from twirl_mjx.policies.resolve import Terms, resolve_policy

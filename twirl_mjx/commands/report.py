@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from pathlib import Path
 
+from twirl_mjx import files
 from twirl_mjx.commands.console import parse, say
 
 
@@ -18,6 +19,8 @@ class ReportOptions:
     """The page."""
     media: tuple[Path, ...] = ()
     """Films and pictures to show, in order."""
+    overwrite: bool = False
+    """Replace a page that this command did not write."""
 
 
 def main(argv: list[str]) -> int:
@@ -25,5 +28,6 @@ def main(argv: list[str]) -> int:
     from twirl_mjx.figures.report import write_report
 
     options = parse(ReportOptions, argv, "twirl report")
+    files.check_ours(options.out, overwrite=options.overwrite)
     say(f"wrote {write_report(options.results, options.out, options.media)}")
     return 0

@@ -1,39 +1,52 @@
-"""Rehearsal: an exported policy in a control loop of its own, before it meets a robot.
+"""Rehearsal: a policy in a control loop of its own, before it meets a robot.
 
 Nothing of the training simulation runs here. C MuJoCo advances at 1 ms with every body part
-colliding; a 20 Hz loop reads noisy sensors, builds the observation (``deploy.reference``), asks
-the policy, filters the command and, a latency later, hands joint targets to motors with a PD law
-and a torque-speed limit (``deploy.robot``).
+colliding; a 20 Hz loop reads noisy sensors, builds the observation (``deploy.pilots``), asks the
+policy, filters the command and, a latency later, hands joint targets to motors with a PD law and a
+torque-speed limit (``deploy.robot``).
 """
 
 from __future__ import annotations
 
 import dataclasses
 from collections import deque
-from pathlib import Path
+from collections.abc import Callable
 from typing import Any
 
 import mujoco
 import numpy as np
 
-from twirl_mjx.deploy.reference import TASKS, Observer, Score
-from twirl_mjx.deploy.robot import (
-    CONTROL_HZ,
-    IDEAL,
-    CommandFilter,
-    Contacts,
-    RehearsalConfig,
-    Sensors,
-    build_model,
-    motor_torque,
-)
-from twirl_mjx.policies.learned import load_policy
+from twirl_mjx.deploy.conditions import CONTROL_HZ, IDEAL, RehearsalConfig
+from twirl_mjx.deploy.imitation import FollowScore
+from twirl_mjx.deploy.pilots import Pilot, find_pilot
+from twirl_mjx.deploy.reference import Reading, Score
+from twirl_mjx.deploy.robot import CommandFilter, Contacts, Sensors, build_model, motor_torque
+from twirl_mjx.figures import statistics
+from twirl_mjx.policies.resolve import PLAIN, Terms
+from twirl_mjx.sim.engine import silence
 
-__all__ = ["IDEAL", "Episode", "Rehearsal", "RehearsalConfig", "rehearse"]
+__all__ = ["IDEAL", "Episode", "Rehearsal", "RehearsalConfig", "Row", "rehearse"]
 
 BANDS = 24
 """Hurdle bands laid out: more than 20 s at 2 m/s can reach."""
-FRONT_FEET = ("FR_foot", "FL_foot")
+FEET = ("FR_foot", "FL_foot", "RR_foot", "RL_foot")
+UNITS = {
+    "return": "1",
+    "episode_length": "control steps",
+    "terminated": "1",
+    "standing_time": "s",
+    "min_distance": "m",
+    "final_distance": "m",
+    "forward_speed": "m/s",
+    "peak_torque": "N m",
+    "mean_power": "W",
+    "clipped": "1",
+    "hurdles_passed": "hurdles",
+    "tracking": "1",
+    "leaps": "cycles",
+    "flights": "cycles",
+}
+"""Metric -> unit."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,15 +56,35 @@ class Episode:
     metrics: dict[str, float]
     """``return``, ``episode_length`` (control steps), ``standing_time`` (s) and more."""
     cause: str
-    """Why it ended: ``time``, ``fall``, ``hurdle`` or ``diverged``."""
+    """Why it ended: ``time``, ``fall``, ``hurdle``, ``lost`` or ``diverged``."""
     qpos: np.ndarray
     """[T + 1, 7 + J] true state at every control step, for rendering."""
     goals: np.ndarray
     """[T + 1, 2] m, goal at every control step, world frame."""
     observations: np.ndarray
-    """[T, O] what the policy was given."""
+    """[T, O] what the policy was given; of a foreign one, what the task would have shown."""
     actions: np.ndarray
     """[T, A] what it answered."""
+    readings: list[Reading] = dataclasses.field(default_factory=list)
+    """[T] what was measured at every decision."""
+    targets: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros((0, 12)))
+    """[T, 12] rad, joint targets that followed, filtered and within the limits."""
+    hurdles: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0))
+    """[K] m, x of the hurdles."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Row:
+    """One line of a rehearsal's table."""
+
+    metric: str
+    unit: str
+    mean: float
+    """Over the episodes."""
+    low: float
+    """Lower end of the 95 % bootstrap interval of the mean over episodes; NaN for one episode."""
+    high: float
+    """Upper end."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -73,6 +106,18 @@ class Rehearsal:
         count = len(self.episodes)
         shares = {f"ended/{c}": sum(e.cause == c for e in self.episodes) / count for c in causes}
         return mean | shares
+
+    def table(self) -> list[Row]:
+        """Return mean and interval of every metric, and of every cause of an end."""
+        columns = {n: [e.metrics[n] for e in self.episodes] for n in self.episodes[0].metrics}
+        for cause in sorted({e.cause for e in self.episodes}):
+            columns[f"ended/{cause}"] = [float(e.cause == cause) for e in self.episodes]
+        rows = []
+        for name, values in columns.items():
+            found = statistics.bootstrap([np.array(values)], statistics.mean)
+            unit = UNITS.get(name, "1")
+            rows.append(Row(name, unit, found.estimate, found.low, found.high))
+        return rows
 
 
 @dataclasses.dataclass
@@ -140,18 +185,16 @@ def advance(
 
 
 def run_episode(
-    policy: Any, task: str, config: RehearsalConfig, rng: np.random.Generator
+    pilot: Pilot, task: str, config: RehearsalConfig, rng: np.random.Generator
 ) -> Episode:
     """Rehearse one episode from rest on four feet at the origin, facing +x.
 
     Args:
-        policy: ``act(obs [O]) -> action [A]``; ``reset()`` is called first when it has one.
+        pilot: What decides.
         task: one of ``reference.TASKS``.
         config: conditions.
         rng: draws goal, hurdles and noise.
     """
-    if hasattr(policy, "reset"):
-        policy.reset()
     hurdles = draw_hurdles(config, rng) if task == "hurdles" else np.zeros(0)
     drawn = draw_goal(config, rng)
     model = build_model(config, hurdles)
@@ -160,34 +203,46 @@ def run_episode(
     mujoco.mj_forward(model, data)
     sensors, contacts = Sensors(config, rng), Contacts(model, task)
     drive = Drive(np.zeros(model.nu), np.zeros(model.nu))
-    score = Score(task, hurdles, config.height_of)
+    score = _score(pilot, task, hurdles, config)
     score.start(data.qpos[:3], score.goal(drawn))
     reading = sensors.read(data)
-    observer, command = Observer(task, reading), CommandFilter(data.qpos[7:])
+    pilot.reset(reading)
+    command = CommandFilter(reading.joint_pos)  # a robot knows what it measures
     targets = deque([(0, data.qpos[7:].copy())])
-    feet = [model.geom(name).id for name in FRONT_FEET]
+    feet = [model.geom(name).id for name in FEET]
     radii = model.geom_size[feet, 0]
-    qpos, goals, observations, actions = [data.qpos.copy()], [score.goal(drawn)], [], []
-    cause, step = None, 0
+    qpos, goals = [data.qpos.copy()], [score.goal(drawn)]
+    decisions: list[tuple[np.ndarray, ...]] = []
+    readings: list[Reading] = []
+    cause, step, clipped = None, 0, 0.0
     while cause is None and step < round(config.episode_s * CONTROL_HZ):
         goal = score.goal(drawn)
-        obs = observer.observe(reading, goal)
-        action = np.clip(policy.act(obs), -1.0, 1.0)
-        start = step * config.n_substeps + config.latency_steps
-        targets.append((start, command(action)))
+        obs, wanted = pilot.decide(reading, goal)
+        action = np.clip(wanted, -1.0, 1.0)
+        clipped += float(np.mean(np.abs(wanted) > 1.0 + 1e-3))
+        target = command(action)
+        targets.append((step * config.n_substeps + config.latency_steps, target))
+        decisions.append((obs, action, target))
+        readings.append(reading)
         cause = advance(model, data, config, targets, contacts, drive)
         if cause != "diverged":
             score.step(data.qpos, data.qvel, data.geom_xpos[feet, 2] - radii, goal)
+            cause = cause or score.cause()
             reading = sensors.read(data)
-            observer.push(reading, action)
+            pilot.push(reading, action)
             qpos.append(data.qpos.copy())
             goals.append(score.goal(drawn))
-        observations.append(obs)
-        actions.append(action)
         step += 1
-    metrics = _metrics(score, np.array(qpos), step, cause, drive)
-    arrays = (np.array(x) for x in (qpos, goals, observations, actions))
-    return Episode(metrics, cause or "time", *arrays)
+    metrics = _metrics(score, np.array(qpos), step, cause, drive) | {"clipped": clipped / step}
+    observations, actions, followed = (np.array(x) for x in zip(*decisions, strict=True))
+    return Episode(metrics, cause or "time", np.array(qpos), np.array(goals), observations, actions,
+                   readings, followed, hurdles)  # fmt: skip
+
+
+def _score(pilot: Pilot, task: str, hurdles: np.ndarray, config: RehearsalConfig) -> Score:
+    if task == "imitate":
+        return FollowScore(task, hurdles, clip=pilot.clip, options=pilot.options)
+    return Score(task, hurdles, config.height_of)
 
 
 def _metrics(
@@ -206,9 +261,10 @@ def _metrics(
         "peak_torque": float(drive.peak.max()),
         "mean_power": float(drive.work.sum()) / seconds,
     }
-    if score.task == "hurdles":
-        metrics["hurdles_passed"] = float(score.passed)
-    return metrics
+    if score.task == "imitate":  # it has no goal and nobody stands up
+        for name in ("standing_time", "min_distance", "final_distance"):
+            del metrics[name]
+    return metrics | score.extra(steps)
 
 
 def rehearse(
@@ -218,31 +274,34 @@ def rehearse(
     episodes: int = 8,
     seed: int = 0,
     config: RehearsalConfig | None = None,
+    options: Any = None,
+    terms: Terms = PLAIN,
+    say: Callable[[str], None] = print,
 ) -> Rehearsal:
     """Rehearse a policy.
 
     Args:
-        policy: a policy file (``.npz``, ``.onnx``), a run directory, or an object with ``act``.
+        policy: a policy file (``.npz``, ``.onnx``), a run directory, anything else that
+            ``--source`` takes and that acts, or an object with ``act``.
         task: the task; by default the one the policy file names.
         episodes: number of episodes; episode ``i`` depends on ``seed`` and ``i`` only.
         seed: seed of goals, hurdles and noise.
         config: conditions; the defaults are like the real robot's, ``IDEAL`` is without them.
+        options: options of the task (the clip of ``imitate``); those on the policy's card, else
+            the paper's, by default.
+        terms: contract and command of a foreign policy.
+        say: prints what a person should know of a foreign policy, a line each.
 
     Raises:
-        ValueError: a task that cannot be rehearsed, or a policy for another observation.
+        ValueError: a task that cannot be rehearsed, a policy for another observation or of another
+            robot, or one that does not act.
     """
-    loaded = load_policy(policy) if isinstance(policy, str | Path) else policy
-    header = getattr(loaded, "header", None)
-    task = task or (header.task if header else None)
-    if task not in TASKS:
-        raise ValueError(
-            f"cannot rehearse task {task!r}; choose one of {', '.join(TASKS)}"
-            + ("" if task else " (the policy does not name its task)")
-        )
     if episodes < 1:
         raise ValueError(f"episodes must be at least 1, got {episodes}")
+    silence()
+    pilot, task = find_pilot(policy, task, options, terms, say)
     config = config or RehearsalConfig()
     results = [
-        run_episode(loaded, task, config, np.random.default_rng([seed, i])) for i in range(episodes)
+        run_episode(pilot, task, config, np.random.default_rng([seed, i])) for i in range(episodes)
     ]
     return Rehearsal(task, config, results)

@@ -6,106 +6,21 @@ simulation, only the robot's MJCF file.
 
 from __future__ import annotations
 
-import dataclasses
-from typing import Literal
-
 import mujoco
 import numpy as np
 
 from twirl_mjx.assets import asset_path
+from twirl_mjx.deploy.conditions import CONTROL_HZ, RehearsalConfig
 from twirl_mjx.deploy.reference import FALL_PARTS, Reading, quaternion_matrix
 
-CONTROL_HZ = 20
 POSE = np.tile([0.0, 0.9, -1.8], 4)
 SWING = np.tile([0.6, 1.2, 1.2], 4)
 LOWER = np.tile([-0.802851455917, -1.0471975512, -2.69653369433], 4)
 UPPER = np.tile([0.802851455917, 4.18879020479, -0.916297857297], 4)
+KNEE_RADIUS = 0.015
+"""m, of the calf at the knee."""
 BAND_HALF_SIZE = (0.1, 20.0, 0.005)
 """m, half extents of a hurdle band: 0.2 m long, endless for the robot, 0.01 m tall."""
-
-
-@dataclasses.dataclass(frozen=True)
-class RehearsalConfig:
-    """How far the rehearsal is from the ideal loop; the defaults are like the real robot's."""
-
-    sim_dt: float = 0.001
-    """Physics step, s; the control step of 0.05 s must be a multiple of it."""
-    latency_ms: float = 15.0
-    """Time from reading the sensors to the motors' new targets, ms."""
-    orientation_noise: float = 0.01
-    """Standard deviation of the measured orientation per axis, rad."""
-    rate_noise: float = 0.05
-    """Standard deviation of the measured angular velocity, rad/s."""
-    joint_noise: float = 0.005
-    """Standard deviation of the measured joint angles, rad."""
-    position_noise: float = 0.005
-    """Standard deviation of the estimated base position per reading, m."""
-    position_drift: float = 0.01
-    """Random walk of the estimated base position, m per square root of a second."""
-    torque_limit: float = 33.5
-    """Motor torque limit, N m (URDF)."""
-    full_torque_speed: float = 10.5
-    """Joint speed up to which the full torque is available, rad/s; half the no-load speed."""
-    no_load_speed: float = 21.0
-    """Joint speed at which no torque is left to accelerate further, rad/s (URDF)."""
-    kp: float = 60.0
-    """Position gain, N m/rad."""
-    kd: float = 3.0
-    """Velocity gain, N m s/rad."""
-    friction: float = 1.0
-    """Friction coefficient between feet and ground."""
-    episode_s: float = 20.0
-    """Length of an episode, s."""
-    goal_distance: float | None = 1.0
-    """Distance of the biped's goal, m, in a random direction; ``None`` draws it as in training."""
-    hurdle_gap: float | None = None
-    """Distance between hurdles, m; ``None`` draws every gap from U(1.6, 2.6) m."""
-    height_of: Literal["root", "front_feet"] = "front_feet"
-    """Height that ``stand`` rewards."""
-
-    def __post_init__(self) -> None:
-        """Check the steps and ranges."""
-        steps = 1.0 / (CONTROL_HZ * self.sim_dt) if self.sim_dt > 0.0 else 0.0
-        if steps < 1.0 or abs(steps - round(steps)) > 1e-6:
-            nearest = 1.0 / (CONTROL_HZ * max(1, round(steps or 50.0)))
-            raise ValueError(
-                f"sim_dt {self.sim_dt} s does not divide the control step of 0.05 s (nearest:"
-                f" {nearest:.6g})"
-            )
-        if not 0.0 <= self.latency_ms <= 200.0:
-            raise ValueError(f"latency_ms must be in [0, 200], got {self.latency_ms}")
-        if not 0.0 <= self.full_torque_speed < self.no_load_speed:
-            raise ValueError(
-                f"full_torque_speed {self.full_torque_speed} rad/s must be at least 0 and below "
-                f"no_load_speed {self.no_load_speed} rad/s"
-            )
-        for name in (f.name for f in dataclasses.fields(self) if f.name.endswith("_noise")):
-            if getattr(self, name) < 0.0:
-                raise ValueError(f"{name} must not be negative, got {getattr(self, name)}")
-
-    @property
-    def n_substeps(self) -> int:
-        """Physics steps per control step."""
-        return round(1.0 / (CONTROL_HZ * self.sim_dt))
-
-    @property
-    def latency_steps(self) -> int:
-        """Latency in physics steps, rounded."""
-        return round(0.001 * self.latency_ms / self.sim_dt)
-
-
-IDEAL = RehearsalConfig(
-    latency_ms=0.0,
-    orientation_noise=0.0,
-    rate_noise=0.0,
-    joint_noise=0.0,
-    position_noise=0.0,
-    position_drift=0.0,
-    full_torque_speed=1e6,
-    no_load_speed=2e6,
-    goal_distance=None,
-)
-"""No latency, no noise, torque limit only: the training task in C MuJoCo at 1 ms."""
 
 
 def build_model(config: RehearsalConfig, hurdles: np.ndarray) -> mujoco.MjModel:
@@ -203,11 +118,12 @@ class Sensors:
 
     def __init__(self, config: RehearsalConfig, rng: np.random.Generator) -> None:
         self._config, self._rng = config, rng
+        self._more = rng.spawn(1)[0]  # what is drawn for foreign policies changes nothing else
         self._drift = np.zeros(3)
 
     def read(self, data: mujoco.MjData) -> Reading:
         """Return the reading of one control step."""
-        c, normal = self._config, self._rng.standard_normal
+        c, normal, more = self._config, self._rng.standard_normal, self._more.standard_normal
         self._drift += c.position_drift / np.sqrt(CONTROL_HZ) * normal(3)
         turn = c.orientation_noise * normal(3)
         small = np.concatenate([[1.0], 0.5 * turn])
@@ -217,6 +133,8 @@ class Sensors:
             angular_velocity=data.qvel[3:6] + c.rate_noise * normal(3),
             joint_pos=data.qpos[7:19] + c.joint_noise * normal(12),
             position=data.qpos[:3] + self._drift + c.position_noise * normal(3),
+            velocity=data.qvel[:3] + c.velocity_noise * more(3),
+            joint_vel=data.qvel[6:18] + c.joint_velocity_noise * more(12),
         )
 
 
@@ -230,12 +148,16 @@ class Contacts:
         )
         self._band = np.array([name.startswith("hurdle_") for name in names])
         self._watched = self._fall | self._band
+        knees = range(model.nbody) if task == "imitate" else ()
+        self._knees = [i for i in knees if model.body(i).name.endswith("_calf")]
 
     def cause(self, data: mujoco.MjData) -> str | None:
         """Return ``hurdle``, ``fall`` or, when the episode goes on, ``None``.
 
         The robot does not touch itself, so every contact has one geom of the ground.
         """
+        if self._knees and data.xpos[self._knees, 2].min() <= KNEE_RADIUS:
+            return "fall"
         pairs = data.contact.geom
         if not self._watched[pairs].any():
             return None

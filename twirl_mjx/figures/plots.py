@@ -8,6 +8,7 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 
+from twirl_mjx import files
 from twirl_mjx.figures.aggregate import statistics_of
 from twirl_mjx.figures.bars import ablation, shift_bars
 from twirl_mjx.figures.canvas import write_png
@@ -45,6 +46,7 @@ def read_grids(
     Args:
         results_dir: ``experiments/results``.
         say: Called with one line per grid that is left out.
+        overwrite: Whether pictures may be replaced that this did not write.
 
     Returns:
         Grid -> (curve rows, episode rows), in the order of ``place``, then of names; None where
@@ -106,7 +108,11 @@ def drawings(grid: str, curves: Table | None, episodes: Table | None) -> Iterato
 
 
 def make_figures(
-    results_dir: str | Path, output_dir: str | Path, say: Callable[[str], None] = print
+    results_dir: str | Path,
+    output_dir: str | Path,
+    say: Callable[[str], None] = print,
+    *,
+    overwrite: bool = False,
 ) -> list[Path]:
     """Draw every figure of every grid as PNG.
 
@@ -114,19 +120,23 @@ def make_figures(
         results_dir: ``experiments/results``, with ``<grid>/<arm>.csv`` below it.
         output_dir: Directory of the pictures, made if needed.
         say: Called with one line per grid that is left out.
+        overwrite: Whether pictures may be replaced that this did not write.
 
     Returns:
         The files written, ``<output_dir>/<grid>_<kind>_<metric>_<statistic>.png``.
 
     Raises:
         TableError: If a table is not valid.
+        FileError: A picture is there that this did not write; nothing is drawn then.
     """
-    paths = []
-    for grid, (curves, episodes) in read_grids(results_dir, say).items():
-        for drawing in drawings(grid, curves, episodes):
-            path = Path(output_dir) / f"{drawing.name}.png"
-            paths.append(write_png(drawing.draw("light"), path))
-    return paths
+    wanted = [
+        (drawing, Path(output_dir) / f"{drawing.name}.png")
+        for grid, (curves, episodes) in read_grids(results_dir, say).items()
+        for drawing in drawings(grid, curves, episodes)
+    ]
+    for _, path in wanted:
+        files.check_ours(path, overwrite=overwrite)
+    return [write_png(drawing.draw("light"), path) for drawing, path in wanted]
 
 
 def _kinds(table: Table) -> list[tuple[str, str]]:

@@ -116,16 +116,16 @@ class ShardedEnv(VectorEnv):
         super().__init__(env.task, env.scene, env.engine, **make(env.num_envs))
         local = VectorEnv(env.task, env.scene, env.engine, **make(part))
         self._step = jax.shard_map(
-            local.step,
+            local.step_and_fault,
             mesh=mesh,
             in_specs=(PartitionSpec(WORLDS), PartitionSpec(WORLDS)),
-            out_specs=PartitionSpec(WORLDS),
+            out_specs=(PartitionSpec(WORLDS), PartitionSpec(WORLDS)),
             check_vma=False,  # the solver's loops carry plain constants
         )
 
     def step(self, state: EnvState, action: jax.Array) -> EnvState:
         """Advance every world by one control step; see :class:`VectorEnv`."""
-        return self._step(state, action)
+        return self._step(state, action)[0]
 
 
 _EVERYWHERE = PartitionSpec()
