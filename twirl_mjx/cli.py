@@ -29,6 +29,7 @@ COMMANDS = {
     "report": "write the results as one HTML page",
     "bench": "measure learner, worlds and start-up on this machine",
     "rehearse": "run a policy in an independent simulator with latency and noise",
+    "view": "watch a policy in a browser and touch it, or write a replay page",
     "demo": "render and evaluate the shipped policies; trains nothing",
     "runs": "list, show, compare and prune runs",
     "curriculum": "train the chain of tasks one after another",

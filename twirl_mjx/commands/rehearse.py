@@ -10,8 +10,8 @@ import tyro
 
 from twirl_mjx.checks import check_range
 from twirl_mjx.commands.console import parse, say
+from twirl_mjx.deploy.conditions import RehearsalConfig
 from twirl_mjx.deploy.rehearsal import rehearse
-from twirl_mjx.deploy.robot import RehearsalConfig
 
 
 @dataclasses.dataclass(frozen=True)

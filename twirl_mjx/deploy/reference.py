@@ -121,7 +121,12 @@ class Score:
         self.previous_distance = self.min_distance = float(np.linalg.norm(goal - position[:2]))
 
     def step(
-        self, qpos: np.ndarray, qvel: np.ndarray, front_feet: np.ndarray, goal: np.ndarray
+        self,
+        qpos: np.ndarray,
+        qvel: np.ndarray,
+        front_feet: np.ndarray,
+        goal: np.ndarray,
+        ground: float = 0.0,
     ) -> float:
         """Score one control step.
 
@@ -130,6 +135,7 @@ class Score:
             qvel: [18] true velocities at its end.
             front_feet: [2] m, height of the lowest point of the front feet over the ground.
             goal: [2] m, goal of the step.
+            ground: height of the ground under the base, m.
 
         Returns:
             The reward.
@@ -144,7 +150,7 @@ class Score:
             reward = self._hurdles(qpos, qvel)
         else:
             foot_centre = float(front_feet.mean()) + 0.02
-            height = foot_centre if self._rewards_front_feet() else qpos[2]
+            height = foot_centre if self._rewards_front_feet() else qpos[2] - ground
             reward = (0.5 * cosine + 0.5) ** 2 + np.exp(height) - 1.0
         if self.task == "biped":
             facing = -rotation[:2, 2] @ to_goal / max(distance, 1e-6)
