@@ -209,3 +209,9 @@ def test_output_that_nobody_reads_is_no_crash() -> None:
     run.stdout.close()
     assert "Traceback" not in run.communicate(timeout=120)[1]
     assert run.returncode in (0, 141)  # 0 where the whole text fits into the pipe's buffer
+
+
+@pytest.mark.parametrize("name", ["a b/x", "a b/x.mp4", "a b/x.png"])
+def test_a_name_with_its_ending_is_that_file(name: str) -> None:
+    assert render.stem_of(Path(name)) == Path("a b/x")
+    assert render.stem_of(Path("a b/x.1")) == Path("a b/x.1")

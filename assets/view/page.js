@@ -93,6 +93,7 @@ function startDrawing(view, frameAt) {
     const frame = frameAt(now);
     if (frame) {
       const share = frame.jump ? 1 : 1 - Math.exp((before - now) / FOLLOW_MS);
+      view.covered = document.querySelector("aside").offsetWidth;
       if (at("follow").checked) view.follow(frame.poses.slice(7, 10), share);
       view.draw(frame);
     }
@@ -133,6 +134,8 @@ function replay(record, view) {
     play(!playing);
   };
   const restart = () => { [time, jump] = [0, true]; play(true); };
+  const asked = /^#t=([0-9.]+)$/.exec(location.hash);  // FILE.html#t=2.5 opens there, at rest
+  if (asked) { time = Math.min(Number(asked[1]), end); play(false); }
   at("pause").addEventListener("click", toggle);
   at("restart").addEventListener("click", restart);
   at("time").addEventListener("input", () => { time = at("time").value * end; play(false); });

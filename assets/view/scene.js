@@ -235,6 +235,7 @@ class SceneView {
                             [SHAPES.cylinder([0.01, 0.15]), green, [0, 0, 0.15, 1, 0, 0, 0]]]);
     this.shaft = this.solid([[SHAPES.cylinder([0.012, 0.5]), red, [0, 0, 0.5, 1, 0, 0, 0]]]);
     this.tip = this.solid([[SHAPES.cone([0.035, 0.05]), red, [0, 0, 0, 1, 0, 0, 0]]]);
+    this.covered = this.shift = 0;  // pixels on the right that something else covers; their share
     this.setSky();
   }
 
@@ -374,9 +375,9 @@ class SceneView {
     gl.viewport(0, 0, width, height);
     gl.clearColor(...this.sky, 1);
     gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
-    const at = this.program.at;
-    this.matrix = multiply(perspective(0.7, width / Math.max(height, 1), 0.05, 120),
-                           lookAt(eye, target));
+    const at = this.program.at, lens = perspective(0.7, width / Math.max(height, 1), 0.05, 120);
+    lens[8] = this.shift = this.covered / Math.max(canvas.clientWidth, 1);
+    this.matrix = multiply(lens, lookAt(eye, target));
     gl.useProgram(this.program.program);
     gl.uniformMatrix4fv(at.camera, false, this.matrix);
     gl.uniformMatrix4fv(at.sun, false, light);
@@ -402,7 +403,7 @@ class SceneView {
     const eye = this.eye(), back = normalize(add(eye, target, -1));
     const right = normalize(cross([0, 0, 1], back)), up = cross(back, right);
     const tan = Math.tan(0.35), aspect = box.width / box.height;
-    const u = (2 * (x - box.left) / box.width - 1) * tan * aspect;
+    const u = (2 * (x - box.left) / box.width - 1 + this.shift) * tan * aspect;
     const v = (1 - 2 * (y - box.top) / box.height) * tan;
     return { eye, way: normalize(add(add(add([0, 0, 0], right, u), up, v), back, -1)) };
   }

@@ -14,6 +14,7 @@ from twirl_mjx import files
 from twirl_mjx.assets import asset_path
 from twirl_mjx.checks import check_choice
 from twirl_mjx.commands.console import parse, say
+from twirl_mjx.commands.render import stem_of
 from twirl_mjx.motion.leap_config import LeapConfig
 
 FRAME_DT = 0.025
@@ -40,7 +41,7 @@ class ShowOptions:
     """Clip files; the shipped leap by default."""
     out: Path = Path("runs/clip")
     """Writes <out>.png, <out>-film.mp4 and .png and, for several clips, <out>-compare.png; with or
-    without the ending .png."""
+    without an ending."""
     source: str = ""
     """Where the other clips come from, written into the comparison."""
 
@@ -86,7 +87,7 @@ def _show(argv: list[str], set_up: Callable[[bool], None]) -> int:
     from twirl_mjx.sim.scene import Bands, build_scene
 
     clips = [read_clip(path) for path in options.clips or (asset_path("a1", "leap.json"),)]
-    stem = options.out.with_suffix("") if options.out.suffix == ".png" else options.out
+    stem = stem_of(options.out)
     show_lib.show(clips[0], f"{stem}.png")
     written = [f"{stem}.png"]
     times = np.arange(0.0, 2 * clips[0].cycle_duration, FRAME_DT)

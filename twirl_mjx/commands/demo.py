@@ -10,7 +10,7 @@ from pathlib import Path
 from twirl_mjx.assets import asset_path
 from twirl_mjx.checks import check_range
 from twirl_mjx.commands.console import parse, say
-from twirl_mjx.commands.render import FILM_SECONDS, RenderOptions, config_of, film
+from twirl_mjx.commands.render import FILM_SECONDS, RenderOptions, config_of, film, record
 
 
 @dataclasses.dataclass(frozen=True)
@@ -22,9 +22,9 @@ class DemoOptions:
     seed: int = 3_000_017
     """Seed of the episodes."""
     out: Path = Path("runs/demo")
-    """Folder of the films."""
+    """Folder of the films and replays."""
     film: bool = True
-    """Also film one episode of each."""
+    """Also film one episode of each, and write it as a page that replays it."""
     seconds: float = 10.0
     """Longest film."""
 
@@ -50,6 +50,9 @@ def main(argv: list[str], set_up: Callable[[bool], None]) -> int:
         raise FileNotFoundError(f"no policy in {folder}: train one with `twirl train`")
     for path in found:
         _show(path, options)
+    if options.film:
+        say(f"open {options.out}/*.html in a browser to turn, stop and slow what was filmed")
+        say("`twirl view` lets you push the robot and move its goal")
     return 0
 
 
@@ -62,7 +65,8 @@ def _show(path: Path, options: DemoOptions) -> None:
     from twirl_mjx.worlds.make import make_env
 
     began = time.monotonic()
-    say(f"{path.stem}: evaluating {options.episodes} episodes" + ", then filming" * options.film)
+    then = ", then filming one and writing its replay" * options.film
+    say(f"{path.stem}: evaluating {options.episodes} episodes{then}")
     config = config_of(str(path), None)
     env = make_env(config, num_envs=options.episodes)
     evaluate = evaluate_policy(env, resolve_policy(str(path), config).policy)
@@ -70,6 +74,10 @@ def _show(path: Path, options: DemoOptions) -> None:
     means = ", ".join(f"{name} {value:.3g}" for name, value in episode_means(values).items())
     say(f"{path.stem}: {means}")
     if options.film:
+        from twirl_mjx.commands.view import write_recording
+
         wanted = RenderOptions(str(path), seed=options.seed, seconds=options.seconds)
-        film(config, wanted, options.out / path.stem)
+        recording = record(config, wanted)
+        film(config, recording, options.out / path.stem, wanted.panels)
+        write_recording(options.out / f"{path.stem}.html", config, recording, title=path.stem)
     say(f"{path.stem}: {time.monotonic() - began:.0f} s")

@@ -9,7 +9,6 @@ from typing import Annotated
 import tyro
 
 from twirl_mjx.commands.console import parse, say
-from twirl_mjx.deploy.export import export_onnx
 
 
 @dataclasses.dataclass(frozen=True)
@@ -25,5 +24,7 @@ class ExportOptions:
 def main(argv: list[str]) -> int:
     """Export."""
     options = parse(ExportOptions, argv, "twirl export")
+    from twirl_mjx.deploy.export import export_onnx
+
     say(f"wrote {export_onnx(options.policy, options.out)}")
     return 0

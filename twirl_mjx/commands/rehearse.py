@@ -11,7 +11,6 @@ import tyro
 from twirl_mjx.checks import check_range
 from twirl_mjx.commands.console import parse, say
 from twirl_mjx.deploy.conditions import RehearsalConfig
-from twirl_mjx.deploy.rehearsal import rehearse
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,6 +34,8 @@ def main(argv: list[str]) -> int:
     options = parse(RehearseOptions, argv, "twirl rehearse")
     check_range("episodes", options.episodes, 1, 100_000)
     check_range("seed", options.seed, 0, 2**32 - 1)
+    from twirl_mjx.deploy.rehearsal import rehearse
+
     result = rehearse(
         options.policy,
         task=options.task,

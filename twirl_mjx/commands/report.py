@@ -6,6 +6,7 @@ import dataclasses
 from pathlib import Path
 
 from twirl_mjx.commands.console import parse, say
+from twirl_mjx.commands.waiting import waiting
 
 
 @dataclasses.dataclass(frozen=True)
@@ -22,8 +23,8 @@ class ReportOptions:
 
 def main(argv: list[str]) -> int:
     """Write the page."""
-    from twirl_mjx.figures.report import write_report
-
     options = parse(ReportOptions, argv, "twirl report")
-    say(f"wrote {write_report(options.results, options.out, options.media)}")
+    with waiting("loading matplotlib"):
+        from twirl_mjx.figures.report import write_report
+    say(f"wrote {write_report(options.results, options.out, options.media, say=say)}")
     return 0

@@ -15,18 +15,17 @@ from twirl_mjx import array_files
 from twirl_mjx.assets import asset_path
 from twirl_mjx.checks import check_choice, check_range
 from twirl_mjx.commands.console import parse, say
-from twirl_mjx.commands.render import FILM_SECONDS, config_of
+from twirl_mjx.commands.render import FILM_SECONDS, RenderOptions, config_of, record
 from twirl_mjx.deploy.conditions import CONTROL_HZ, SHIFTS, RehearsalConfig
 from twirl_mjx.deploy.reference import TASKS
 from twirl_mjx.plugins import is_reference
 from twirl_mjx.policies.learned import BEST_POLICY, LAST_POLICY
-from twirl_mjx.view.page import check_page, write_replay
-from twirl_mjx.view.stage import Actor, Stage, readouts
 
 if TYPE_CHECKING:
     import mujoco
 
     from twirl_mjx.evaluation.record import Recording
+    from twirl_mjx.view.stage import Actor
     from twirl_mjx.worlds.config import WorldConfig
 
 CALM = RehearsalConfig(latency_ms=0.0, noise=0.0, full_torque_speed=1e6, no_load_speed=2e6)
@@ -89,6 +88,8 @@ def main(argv: list[str]) -> int:
     """Serve a page until interrupted, or write a replay."""
     options = parse(ViewOptions, argv, "twirl view")
     if options.html is not None:
+        from twirl_mjx.view.page import check_page
+
         check_page(options.html)
         say(f"wrote {_write(options, options.html)}: open it in any browser")
         return 0
@@ -101,6 +102,7 @@ def main(argv: list[str]) -> int:
 
 def _serve(options: ViewOptions) -> int:
     from twirl_mjx.view.server import serving
+    from twirl_mjx.view.stage import Stage
 
     stage = Stage(
         _cast(options), config=options.robot, shift=options.shift, seed=options.seed, note=say
@@ -128,6 +130,8 @@ def _has_windows() -> bool:
 
 def _cast(options: ViewOptions) -> dict[str, Actor]:
     """Return who can be chosen on the page: what was named, then the shipped policies."""
+    from twirl_mjx.view.stage import Actor
+
     folder = asset_path("policies")
     shipped = {path.stem: Actor(path) for path in sorted(folder.glob("*.npz"))}
     shipped = {name: actor for name, actor in shipped.items() if name.split("_")[0] in TASKS}
@@ -138,6 +142,8 @@ def _cast(options: ViewOptions) -> dict[str, Actor]:
 
 
 def _named(options: ViewOptions) -> dict[str, Actor]:
+    from twirl_mjx.view.stage import Actor
+
     name, path, task = options.policy, Path(options.policy), options.task
     if name in GAITS:
         from twirl_mjx.policies import scripted
@@ -202,11 +208,13 @@ def _task_of(name: str) -> str | None:
 def _write_rehearsal(options: ViewOptions, task: str, path: Path) -> Path:
     from twirl_mjx.deploy.trial import Trial
     from twirl_mjx.policies.learned import load_policy
+    from twirl_mjx.view.page import write_replay
+    from twirl_mjx.view.stage import readouts
 
     config = dataclasses.replace(options.robot, **SHIFTS[options.shift])  # pyright: ignore
     policy: Any = options.policy
-    actor = _named(options)[policy] if policy in GAITS else Actor(load_policy(policy))
-    trial = Trial(actor.policy, task, config, np.random.default_rng([options.seed, 0]))
+    acting = _named(options)[policy].policy if policy in GAITS else load_policy(policy)
+    trial = Trial(acting, task, config, np.random.default_rng([options.seed, 0]))
     qpos, goals, values = [], [], []
     for _ in range(round(options.seconds * CONTROL_HZ)):
         trial.step()
@@ -231,21 +239,17 @@ def _write_rehearsal(options: ViewOptions, task: str, path: Path) -> Path:
 
 
 def _write_recording(options: ViewOptions, path: Path) -> Path:
-    from twirl_mjx.evaluation.record import record_episode
-    from twirl_mjx.policies.resolve import resolve_policy
-
-    config = dataclasses.replace(config_of(options.policy, options.task), shift=options.shift)
-    policy = resolve_policy(options.policy, config).policy
-    steps = min(config.episode_length, round(options.seconds * CONTROL_HZ))
-    recording = record_episode(config, policy, seed=options.seed, steps=steps)
-    return write_recording(
-        path, config, recording, title=f"{config.task}: {Path(options.policy).name}"
-    )
+    config = config_of(options.policy, options.task)
+    config = dataclasses.replace(config, shift=options.shift)
+    wanted = RenderOptions(options.policy, seed=options.seed, seconds=options.seconds)
+    title = f"{config.task}: {Path(options.policy).name}"
+    return write_recording(path, config, record(config, wanted), title=title)
 
 
 def write_recording(path: Path, config: WorldConfig, recording: Recording, *, title: str) -> Path:
     """Write a recorded episode as a replay."""
     from twirl_mjx.evaluation.record import scene_model
+    from twirl_mjx.view.page import write_replay
 
     shown = {name: recording.metrics[name].tolist() for name in config.task_type.caption}
     return write_replay(
@@ -263,6 +267,7 @@ def write_recording(path: Path, config: WorldConfig, recording: Recording, *, ti
 def _write_clip(options: ViewOptions, path: Path) -> Path:
     from twirl_mjx.motion.clip import configurations
     from twirl_mjx.motion.formats import read_clip
+    from twirl_mjx.view.page import write_replay
 
     clip = read_clip(options.policy)
     times = np.arange(0.0, min(options.seconds, 4 * clip.cycle_duration), MOTION_DT)
@@ -285,6 +290,8 @@ def _is_trace(path: Path) -> bool:
 
 def _write_trace(trace: Path, path: Path) -> Path:
     """Write a trace: ``qpos`` [T, 19], and if it likes ``goals`` [T, 2] and ``frame_dt`` (s)."""
+    from twirl_mjx.view.page import write_replay
+
     arrays = array_files.read_npz(trace, "a trace")
     frame_dt = float(arrays.get("frame_dt", np.array(1.0 / CONTROL_HZ)))
     check_range(f"frame_dt of {trace}", frame_dt, 1e-4, 10.0)

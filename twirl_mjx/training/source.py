@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import functools
+import time
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -14,6 +16,8 @@ from twirl_mjx.worlds.vector import VectorEnv, make_transition
 
 ROUNDING = 1e-3
 """By which an action may leave [-1, 1] and not count as clipped."""
+PROGRESS_S = 5.0
+"""s between lines of progress."""
 
 
 def collect(
@@ -23,6 +27,7 @@ def collect(
     size: int,
     *,
     max_clipped: float = 1.0,
+    say: Callable[[str], None] = lambda line: None,
 ) -> tuple[Transition, dict[str, float]]:
     """Return exactly ``size`` transitions of ``policy`` acting in ``env``.
 
@@ -34,6 +39,7 @@ def collect(
         key: Seeds worlds and policy.
         size: Transitions wanted.
         max_clipped: Largest share of joint targets outside the action box.
+        say: Gets a line of progress every ``PROGRESS_S``.
 
     Returns:
         Transitions [size, ...] (numpy) and the mean measures of the episodes that ended (none
@@ -51,9 +57,12 @@ def collect(
     run = jax.jit(functools.partial(_collect_chunk, env, policy, chunk))
     rows: list[Transition] = []
     kept = dropped = 0
-    outside = 0.0
+    outside, told = 0.0, time.monotonic()
     sums: dict[str, float] = {}
     while kept < size:
+        if time.monotonic() - told > PROGRESS_S:
+            told = time.monotonic()
+            say(f"collected {kept:,} of {size:,} transitions")
         key, chunk_key = jax.random.split(key)
         carry, (transitions, valid, ended, values, beyond) = run(carry, chunk_key)
         outside += float(np.asarray(beyond)[np.asarray(valid)].sum())
