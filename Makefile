@@ -7,7 +7,7 @@ PYTEST := .venv/bin/pytest
 CASE = $(if $(TASK),--task $(TASK)) $(if $(SHIFT),--shift $(SHIFT)) $(if $(SEED),--seed $(SEED))
 
 .PHONY: help setup bench-setup lint format test test-slow train evaluate collect sweep figures \
-	report render demo bench curriculum clean
+	report render view demo bench curriculum dist clean
 
 help: ## show this table
 	@echo 'usage: make TARGET [TASK=..] [SHIFT=..] [SEED=..] [RUN=..] [GRID=..] [ARGS=".."]'
@@ -57,6 +57,9 @@ report: setup ## write the results as one HTML page
 render: setup ## film RUN=runs/NAME as mp4 and a strip of frames
 	$(TWIRL) render $(RUN) $(ARGS)
 
+view: setup ## watch RUN= (or the shipped biped) in a browser (ARGS="--html replay.html")
+	$(TWIRL) view $(RUN) $(ARGS)
+
 demo: setup ## render and evaluate the shipped policies; trains nothing
 	$(TWIRL) demo $(ARGS)
 
@@ -65,6 +68,11 @@ bench: bench-setup ## measure this machine, beside SBX
 
 curriculum: setup ## train the chain of TASK= with SEED= (ARGS="--shifts": without the shifts)
 	$(TWIRL) curriculum $(if $(TASK),--task $(TASK)) $(if $(SEED),--seed $(SEED)) $(ARGS)
+
+dist: setup ## build wheel and sdist into dist/, and try the wheel in an environment of its own
+	rm -rf dist
+	.venv/bin/python -m hatchling build -d dist
+	$(PYTEST) -m slow tests/test_dist.py
 
 clean: ## remove caches and build products (keeps .venv and runs/)
 	rm -rf build dist .pytest_cache .ruff_cache

@@ -11,7 +11,7 @@ import traceback
 from collections.abc import Callable
 from typing import Any
 
-from twirl_mjx import exits, faults, machine
+from twirl_mjx import __version__, exits, faults, machine
 from twirl_mjx.cache import LEAST_COMPILE_S, cache_folder
 from twirl_mjx.checks import nearest
 from twirl_mjx.commands.waiting import waiting
@@ -44,7 +44,8 @@ def _usage() -> str:
     rows = "\n".join(f"  {name:<{width}}  {about}" for name, about in COMMANDS.items())
     return (
         "usage: twirl COMMAND [options]\n\ncommands:\n"
-        f"{rows}\n\n`twirl COMMAND --help` lists the options of a command.\n"
+        f"{rows}\n\n`twirl COMMAND --help` lists the options of a command, `twirl --version` says"
+        " which this is.\n"
     )
 
 
@@ -132,6 +133,9 @@ def main(argv: list[str] | None = None) -> int:
         print(_usage(), end="")
         return 0 if argv else exits.UNUSABLE
     name, *rest = argv
+    if name == "--version":
+        print(f"twirl {__version__}")
+        return 0
     if name not in COMMANDS:
         close = nearest(name, COMMANDS)
         print(f"twirl: unknown command {name!r} (nearest: {close!r})\n", file=sys.stderr)

@@ -42,13 +42,12 @@ class Picture:
 
     def _geom(self, i: int) -> dict[str, Any]:
         model = self._model
-        material, kind = int(model.geom_matid[i]), _KINDS[int(model.geom_type[i])]
-        colour = model.geom_rgba[i] if material < 0 else model.mat_rgba[material]
+        kind, colour = _KINDS[int(model.geom_type[i])], _colour(model, i)
         geom: dict[str, Any] = {
             "body": self._bodies.index(int(model.geom_bodyid[i])),
             "type": kind,
             "size": model.geom_size[i].round(5).tolist(),
-            "colour": colour[:3].round(3).tolist(),
+            "colour": colour.round(3).tolist(),
             "pose": [*model.geom_pos[i].round(5).tolist(), *model.geom_quat[i].round(6).tolist()],
         }
         if kind == "mesh":
@@ -63,6 +62,21 @@ class Picture:
         mujoco.mj_kinematics(self._model, self._data)
         places = [self._data.xpos[self._bodies], self._data.xquat[self._bodies]]
         return np.concatenate(places, axis=1).astype(np.float32).ravel()
+
+
+def _colour(model: mujoco.MjModel, geom: int) -> np.ndarray:
+    """Return the colour [3] in [0, 1] of a geom: with a texture, the mean of it."""
+    material = int(model.geom_matid[geom])
+    if material < 0:
+        return model.geom_rgba[geom, :3]
+    colour = model.mat_rgba[material, :3]
+    texture = int(model.mat_texid[material, mujoco.mjtTextureRole.mjTEXROLE_RGB.value])
+    if texture < 0:
+        return colour
+    first, channels = model.tex_adr[texture], int(model.tex_nchannel[texture])
+    count = int(model.tex_width[texture]) * int(model.tex_height[texture]) * channels
+    pixels = model.tex_data[first : first + count].reshape(-1, channels)
+    return colour * pixels[:, :3].mean(axis=0) / 255.0
 
 
 def _mesh(model: mujoco.MjModel, mesh: int) -> dict[str, Any]:
