@@ -17,6 +17,7 @@ PAGES = ("*.md", "docs/**/*", "assets/**/*.md", "experiments/**/*", "examples/*"
 
 
 def copy_pages(folder: Path) -> None:
+    """Copy every page, and what pages link to."""
     for pattern in PAGES:
         for path in ROOT.glob(pattern):
             if path.is_file() and "__pycache__" not in path.parts:
@@ -43,6 +44,7 @@ def write_reference(folder: Path) -> None:
 
 
 def main() -> None:
+    """Lay out the pages; a README is the index of its folder."""
     folder = Path(sys.argv[1])
     shutil.rmtree(folder, ignore_errors=True)
     copy_pages(folder)
