@@ -30,8 +30,8 @@ format: setup ## rewrite the code with ruff
 	.venv/bin/ruff check --fix .
 	.venv/bin/ruff format .
 
-test: setup ## the default tests, on the CPU (ARGS="tests/droq -x")
-	$(PYTEST) $(ARGS)
+test: setup ## the default tests, on the CPU, a worker per core (ARGS="tests/droq -x")
+	$(PYTEST) --numprocesses auto --dist worksteal $(ARGS)
 
 test-slow: setup ## the learning curves and other long tests
 	$(PYTEST) -m "slow and not gpu" $(ARGS)

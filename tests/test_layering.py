@@ -42,7 +42,7 @@ ALLOWED: dict[str, set[str]] = {
     "evaluation": ACTING,
     "training": ACTING | {"evaluation", "replay"},
     "deploy": ACTING | {"evaluation", "figures"},
-    "view": BASE | {"deploy", "policies"},
+    "view": BASE | {"sim", "policies", "deploy"},
     "figures": {"checks", "files"},
     "sweep": ACTING | {"training", "figures"},
     "bench": ACTING | {"evaluation", "replay", "training", "deploy", "figures"},

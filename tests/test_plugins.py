@@ -42,3 +42,18 @@ def test_what_cannot_be_loaded_is_one_line(reference: str, message: str, tmp_pat
     with pytest.raises(ValueError, match=message) as refusal:
         plugins.load(reference.format(folder=tmp_path))
     assert "\n" not in str(refusal.value)
+
+
+def test_the_same_file_in_another_place_is_the_same_thing(tmp_path: Path) -> None:
+    registry = plugins.Registry("shift", home=(), accept=lambda item: item, group="none")
+    text = "class Mud:\n    name = 'mud'\n"
+    for folder in ("here", "there", "other"):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "mine.py").write_text(text)
+    (tmp_path / "other" / "mine.py").write_text(text + "    depth = 1\n")
+    assert registry.admit(f"{tmp_path}/here/mine.py:Mud") == "mud"
+    first = registry.get("mud")
+    assert registry.admit(f"{tmp_path}/there/mine.py:Mud") == "mud"
+    assert registry.get("mud") is first
+    with pytest.raises(ValueError, match=r"other/mine.py:Mud: there is another shift called 'mud'"):
+        registry.admit(f"{tmp_path}/other/mine.py:Mud")

@@ -23,7 +23,7 @@ COMMANDS = {
     "evaluate": "evaluate policies across all six dynamics conditions",
     "render": "film a policy as mp4 and a strip of frames, headless",
     "export": "write a policy as an ONNX file",
-    "clip": "make or show a leap clip",
+    "clip": "make, show or check a reference clip",
     "sweep": "run what is missing of an experiment grid",
     "figures": "rebuild all figures from the committed tables",
     "report": "write the results as one HTML page",
@@ -35,7 +35,7 @@ COMMANDS = {
     "curriculum": "train the chain of tasks one after another",
 }
 """Command name to its one-line description; each lives in ``twirl_mjx.commands.<name>``."""
-DRAWING = ("render", "demo", "clip")
+DRAWING = ("render", "demo", "clip", "rehearse")
 """Commands that may draw the robot; they say so to :func:`set_up` once they know."""
 
 

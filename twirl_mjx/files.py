@@ -4,6 +4,8 @@
 disk and takes the target's name; on any failure, an interrupt included, the temporary file is
 removed and what was there before is untouched. Only regular files are replaced: a device, FIFO,
 socket or folder is refused by name, and of a symbolic link the file that it leads to is replaced.
+What a person names on the command line is replaced only if this project wrote it: such files carry
+``MARK``, and ``check_ours`` looks for it before any work is done.
 
 *Reading*: regular files of a bounded size, and errors that name the file, what was expected and
 what helps. Arrays: ``array_files``.
@@ -16,6 +18,7 @@ import csv
 import errno
 import hashlib
 import io
+import itertools
 import json
 import os
 import secrets
@@ -30,6 +33,11 @@ TEXT_LIMIT = 256 * MB
 """Bytes, largest text that is read; a table of a million rows has a third of it."""
 SIZE_LIMIT = 16 << 10 << 20
 """Bytes, largest file that is read: a million source rows have a tenth of it."""
+
+MARK = "made by twirl_mjx"
+"""What films, pictures, pages, exports and clips of ours say in their metadata."""
+MARKED_WITHIN = 4 * MB
+"""Bytes from the start within which a mark stands: in a film it follows the table of frames."""
 
 _KINDS = (
     (stat.S_ISDIR, "a folder"),
@@ -136,6 +144,35 @@ def check_target(path: str | Path) -> Path:
     if not stat.S_ISREG(mode):
         raise FileError(f"{path} is {_kind(mode)} and would be replaced: name a file to write")
     return target
+
+
+def check_ours(path: str | Path, mark: str = MARK, *, overwrite: bool = False) -> Path:
+    """Return the file to write after checking that nobody else's work would be replaced.
+
+    Args:
+        path: The target.
+        mark: Text by which a file of ours is known: ``MARK``, or the header of a table.
+        overwrite: Whether the person said that any file may be replaced.
+
+    Raises:
+        FileError: As :func:`check_target`, or a file is there without the mark.
+        OSError: As the system says.
+    """
+    target = check_target(path)
+    if overwrite or not target.exists() or target.stat().st_size == 0:
+        return target
+    with target.open("rb") as file:
+        if mark.encode() in file.read(MARKED_WITHIN):
+            return target
+    free = next(p for i in itertools.count(2) if not (p := _numbered(Path(path), i)).exists())
+    raise FileError(
+        f"{path} is there and was not written by this command; nothing was touched (nearest:"
+        f" {free}, or --overwrite to replace it)"
+    )
+
+
+def _numbered(path: Path, number: int) -> Path:
+    return path.with_name(f"{path.stem}-{number}{path.suffix}")
 
 
 def make_folders(folder: Path) -> None:

@@ -128,8 +128,10 @@ class Registry[T]:
             raise ValueError(f"{where}{error}") from None
         name: str = accepted.name  # type: ignore[attr-defined]
         known = self._items.get(name)
+        home = self._references.get(name, "registered before")
+        if reference and known is not None and _is_copy(reference, home):
+            return name
         if known is not None and known != accepted:
-            home = self._references.get(name, "registered before")
             raise ValueError(
                 f"{where}there is another {self.kind} called {name!r} ({home})"
                 f" (nearest: {'my_' + name!r})"
@@ -175,7 +177,8 @@ class Registry[T]:
         if name not in self._items and (point := self._entry_points().get(name)) is not None:
             self._add(point.load(), point.value)
             self._references.pop(name, None)  # it is found by its name, in every process
-        check_choice(self.kind, name, self.names())
+        if name not in self._items:
+            check_choice(self.kind, name, self.names())
         return self._items[name]
 
     def names(self) -> tuple[str, ...]:
@@ -206,6 +209,14 @@ class Registry[T]:
             found = importlib.metadata.entry_points(group=self._group)
             self._points = {point.name: point for point in found}
         return self._points
+
+
+def _is_copy(reference: str, other: str) -> bool:
+    """Return whether two references name the same object of files with the same content."""
+    if not is_reference(other):
+        return False
+    (path, name), (other_path, other_name) = split(reference), split(other)
+    return name == other_name and path.read_bytes() == other_path.read_bytes()
 
 
 def _module_of(item: Any) -> str:

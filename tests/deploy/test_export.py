@@ -83,7 +83,7 @@ def test_export_that_differs_is_not_written(
     other = make_policy()
     other.actor_params["mean"]["bias"][3] += 1e-3
     graph = build_graph(other)
-    monkeypatch.setattr(export, "build_graph", lambda policy: graph)
+    monkeypatch.setattr(export, "build_graph", lambda *_: graph)
     with pytest.raises(ValueError, match=r"differs from the policy by .*e-04"):
         export_onnx(make_policy(), tmp_path / "policy.onnx")
     assert not list(tmp_path.iterdir())

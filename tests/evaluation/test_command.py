@@ -80,8 +80,11 @@ def test_what_is_done_is_kept_when_a_later_policy_fails(
     monkeypatch.setattr(evaluate, "evaluate_shifts", fail_later)
     out = tmp_path / "table.csv"
     out.write_text("of yesterday")
-    with pytest.raises(RuntimeError, match="the third"):
+    with pytest.raises(ValueError, match=r"not written by this command.*table-2\.csv"):
         run(out, "trot", "zero", "bound", "--task", "stand")
+    assert out.read_text() == "of yesterday"
+    with pytest.raises(RuntimeError, match="the third"):
+        run(out, "trot", "zero", "bound", "--task", "stand", "--overwrite")
     with out.open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert [row["run"] for row in rows] == ["trot", "trot", "zero", "zero"]

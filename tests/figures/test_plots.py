@@ -80,6 +80,15 @@ def test_a_smoke_run_is_no_result(tmp_path, write, rows_of, facts_of):
     assert said == ["grid 'small': a smoke run is no result, no figure"]
 
 
+def test_a_closing_value_alone_is_no_curve(tmp_path, write, rows_of):
+    rows = [row for seed in (0, 1) for row in rows_of("biped", "icy", "twirl", seed)]
+    rows = [[*row[:5], "eval/return", *row[6:]] for row in rows]
+    closing = [[*row[:5], "eval/final_return", *row[6:]] for row in (rows[20], rows[41])]
+    write(tmp_path / "twirl.csv", tables.CURVE_COLUMNS, [*rows, *closing])
+    curves, _ = tables.read_directory(tmp_path)
+    assert {d.metric for d in plots.drawings("mine", curves, None)} == {"eval/return"}
+
+
 def test_two_settings_have_an_effect_each(tmp_path, write, rows_of):
     rows = [
         row

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+import importlib.util
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -12,11 +14,24 @@ import pytest
 from onnx import TensorProto, helper, numpy_helper
 
 from twirl_mjx.policies.contract import Contract
-from twirl_mjx.policies.scripted import TROT, action_table
+from twirl_mjx.policies.ready import LEGGED_GYM_48
 from twirl_mjx.sim.robots import A1
 
 Shape = list[int | str]
-HIDDEN = 256
+
+
+def load_example() -> Any:
+    """Return ``examples/foreign_trot.py`` as a module."""
+    path = Path(__file__).parents[2] / "examples" / "foreign_trot.py"
+    spec = importlib.util.spec_from_file_location("foreign_trot", path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+EXAMPLE = load_example()
 
 
 def save_graph(
@@ -46,63 +61,82 @@ def save_graph(
     return path
 
 
-def trot_outputs(contract: Contract) -> np.ndarray:
-    """Return one period of the trot [P, J] as the outputs of a policy under ``contract``."""
-    targets = A1.default_pose + action_table(TROT, A1) * A1.action_half_range
-    own = targets[:, contract.joint_order(A1)] - np.array(contract.default_pose)
-    return own / np.asarray(contract.action.scale)
+@functools.cache
+def trot_graph() -> onnx.ModelProto:
+    """Return the joystick trot of 48 inputs, learned once for all tests."""
+    return EXAMPLE.graph(LEGGED_GYM_48)
 
 
-def clone_trot(contract: Contract) -> dict[str, np.ndarray]:
-    """Return weights of a small network that trots: from its last output it knows the next.
-
-    Supervised learning in closed form: ridge regression on random tanh features, on the outputs of
-    the scripted trot with noise all around, so that what strays from the gait is led back to it.
-    """
-    rng = np.random.default_rng(0)
-    cycle = trot_outputs(contract)
-    rest = (A1.default_pose[contract.joint_order(A1)] - np.array(contract.default_pose)) / (
-        contract.action.scale
-    )
-    slices, start = {}, 0
-    for term in contract.observation:
-        slices[term.name] = slice(start, start + term.size)
-        start += term.size
-    rows, answers = [], []
-    for strength in (0.1, 0.3, 0.6, 0.8, 1.0, 1.1, 1.3):
-        for phase in range(len(cycle)):
-            last = rest + strength * (cycle[phase] - rest)
-            grown = rest + min(1.0, strength + 0.2) * (cycle[(phase + 1) % len(cycle)] - rest)
-            noisy = last + 0.05 * rng.standard_normal((60, 12)) * np.abs(cycle).max()
-            rows.append(noisy)
-            answers.append(np.tile(grown, (60, 1)))
-    for start_row in (np.zeros(12), rest):  # at rest the gait begins
-        rows.append(start_row + 0.01 * rng.standard_normal((200, 12)))
-        answers.append(np.tile(rest + 0.3 * (cycle[0] - rest), (200, 1)))
-    last, answer = np.concatenate(rows), np.concatenate(answers)
-    spread = last.std(axis=0)
-    first = np.zeros((contract.observation_size, HIDDEN), np.float32)
-    first[slices["previous_action"]] = rng.standard_normal((12, HIDDEN)) / spread[:, None] / 3.0
-    bias = rng.standard_normal(HIDDEN).astype(np.float32)
-    features = np.tanh(last @ first[slices["previous_action"]] + bias)
-    features = np.concatenate([features, np.ones((len(features), 1))], axis=1)
-    gram = features.T @ features + 1e-2 * np.eye(HIDDEN + 1)
-    second = np.linalg.solve(gram, features.T @ answer).astype(np.float32)
-    return {"w1": first, "b1": bias, "w2": second[:-1], "b2": second[-1]}
+def save_trot(path: Path) -> Path:
+    """Write the joystick trot."""
+    onnx.save(trot_graph(), str(path))
+    return path
 
 
-def mlp_nodes(obs: str, action: str) -> list[Any]:
-    """Return the nodes of a network with one tanh layer."""
-    return [
-        helper.make_node("MatMul", [obs, "w1"], ["p1"]),
-        helper.make_node("Add", ["p1", "b1"], ["s1"]),
-        helper.make_node("Tanh", ["s1"], ["h1"]),
-        helper.make_node("MatMul", ["h1", "w2"], ["p2"]),
-        helper.make_node("Add", ["p2", "b2"], [action]),
+def save_tracker(path: Path, contract: Contract, kind: int = TensorProto.FLOAT) -> Path:
+    """Write a motion tracker: the trot by the number of times it was asked, 20 ms each."""
+    table = (
+        EXAMPLE.teacher(0.7, 0.0, 0.0)[:, contract.joint_order(A1)] - contract.default_pose
+    ) / (np.asarray(contract.action.scale))
+    nodes = [
+        helper.make_node("Cast", ["time_step"], ["ticks"], to=TensorProto.FLOAT),
+        helper.make_node("Mul", ["ticks", "rate"], ["shares"]),
+        helper.make_node("Add", ["shares", "margin"], ["turned"]),
+        helper.make_node("Cast", ["turned"], ["index"], to=TensorProto.INT64),
+        helper.make_node("Mod", ["index", "period"], ["phase"]),
+        helper.make_node("Reshape", ["phase", "flat"], ["row"]),
+        helper.make_node("Gather", ["table", "row"], ["pose"]),
+        helper.make_node("MatMul", ["obs", "zero"], ["none"]),
+        helper.make_node("Add", ["pose", "none"], ["actions"]),
+        helper.make_node("Identity", ["pose"], ["joint_pos"]),
     ]
+    weights = {
+        "rate": np.array(0.4, np.float32),
+        "margin": np.array(0.25, np.float32),
+        "period": np.array(8),
+        "flat": np.array([1]),
+        "table": table.astype(np.float32),
+        "zero": np.zeros((contract.observation_size, 12), np.float32),
+    }
+    return save_graph(
+        path, nodes, {"obs": [1, contract.observation_size], "time_step": [1, 1]},
+        {"actions": [1, 12], "joint_pos": [1, 12]}, weights, kinds={"time_step": kind},
+    )  # fmt: skip
+
+
+def save_lstm(path: Path, rows: int | str = 1) -> Path:
+    """Write a recurrent policy as rsl_rl exports it: obs, h_in, c_in -> actions, h_out, c_out."""
+    rng = np.random.default_rng(1)
+    weights = {
+        "w": rng.standard_normal((1, 32, 48)).astype(np.float32) / 8,
+        "r": rng.standard_normal((1, 32, 8)).astype(np.float32) / 8,
+        "axes": np.array([0]),
+        "w2": rng.standard_normal((8, 12)).astype(np.float32) / 8,
+    }
+    nodes = [
+        helper.make_node("Unsqueeze", ["obs", "axes"], ["x"]),
+        helper.make_node(
+            "LSTM", ["x", "w", "r", "", "", "h_in", "c_in"], ["seq", "h_out", "c_out"],
+            hidden_size=8,
+        ),
+        helper.make_node("Squeeze", ["h_out", "axes"], ["h"]),
+        helper.make_node("MatMul", ["h", "w2"], ["actions"]),
+    ]  # fmt: skip
+    memory: list[int | str] = [1, rows, 8]
+    return save_graph(
+        path, nodes, {"obs": [rows, 48], "h_in": memory, "c_in": memory},
+        {"actions": [rows, 12], "h_out": memory, "c_out": memory}, weights,
+    )  # fmt: skip
 
 
 @pytest.fixture
 def graphs() -> SimpleNamespace:
-    """Return what builds foreign policies: ``save``, ``mlp``, ``clone`` and ``outputs``."""
-    return SimpleNamespace(save=save_graph, mlp=mlp_nodes, clone=clone_trot, outputs=trot_outputs)
+    """Return what writes foreign policies: ``save``, ``trot``, ``tracker``, ``lstm``; and nodes."""
+    return SimpleNamespace(
+        save=save_graph,
+        trot=save_trot,
+        tracker=save_tracker,
+        lstm=save_lstm,
+        teacher=EXAMPLE.teacher,
+        node=helper.make_node,
+    )

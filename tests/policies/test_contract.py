@@ -15,6 +15,7 @@ from twirl_mjx.policies import ready
 from twirl_mjx.policies.contract import Contract, ContractError, Gains, Term
 from twirl_mjx.policies.meeting import FILL, Command, parse_command
 from twirl_mjx.sim.robots import A1
+from twirl_mjx.tasks.observations import Entry
 from twirl_mjx.tasks.registry import TASKS
 
 GO1 = ready.GO1_JOYSTICK
@@ -56,7 +57,7 @@ def test_legged_gym_layout() -> None:
 def test_round_trip(tmp_path: Path) -> None:
     for found in [
         *ready.READY.values(),
-        *(ready.find_contract(t, A1) for t in ("stand", "hurdles")),
+        *(ready.find_contract(t, A1) for t in ("stand", "hurdles", "imitate")),
     ]:
         path = tmp_path / f"{found.name}.json"
         schema.write(path, found)
@@ -65,14 +66,20 @@ def test_round_trip(tmp_path: Path) -> None:
         assert schema.from_json(found.to_json(), "here") == found
 
 
-def test_only_imitate_has_no_contract() -> None:
-    sizes = {"stand": 101, "biped": 101, "hurdles": 95}
-    for task in TASKS.builtin_names():
-        if task in sizes:
-            assert ready.find_contract(task, A1).observation_size == sizes[task]
-        else:
-            with pytest.raises(ContractError, match="depends on the task itself"):
-                ready.find_contract(task, A1)
+def test_every_task_has_a_contract() -> None:
+    sizes = {"stand": 101, "biped": 101, "hurdles": 95, "imitate": 160}
+    assert set(sizes) == set(TASKS.builtin_names())
+    for task, size in sizes.items():
+        found = ready.find_contract(task, A1)
+        assert found.observation_size == size
+        assert (found.motion is not None) == (task == "imitate")
+        assert found.lowpass is not None
+        assert found.lowpass.cutoff_hz == 4.0
+        assert found.joint_limits[2] == pytest.approx((-2.69653369433, -0.916297857297))
+        assert found.torque_limit == (33.5,) * 12
+    entry = Entry("terrain_height", 4, "m")
+    with pytest.raises(ContractError, match=r"'terrain_height', which is no word of a contract"):
+        ready.own_contract("mine", (entry,), A1)
 
 
 FAULTS: list[tuple[dict[str, Any], str]] = [
@@ -99,6 +106,21 @@ FAULTS: list[tuple[dict[str, Any], str]] = [
     ({"memory": [["h", "h"]]}, "pairs of different names"),
     ({"history_layout": "frames"}, "nearest: 'frame'"),
     ({"names": []}, "unknown key in contract 'names'"),
+    ({"joint_limits": [[-1.0, 1.0]] * 3}, "joint_limits has 3 pairs for 12 joints"),
+    ({"joint_limits": [[1.0, -1.0]] * 12}, "joint_limits of FR_hip_joint is"),
+    ({"torque_limit": [20.0] * 3}, "torque_limit has 3 numbers for 12 joints"),
+    ({"gains": {"kp": [20.0], "kd": 0.5}}, "gains.kp has 1 numbers for 12 joints"),
+    ({"lowpass": {"cutoff_hz": 5.0, "b": [0.1, 0.2, 0.1], "a": [1.0, 0.2, 0.1]}}, "equal sums"),
+    ({"lowpass": {"cutoff_hz": 5.0, "b": [1.0], "a": [1.0, 0.0, 0.0]}}, r"lowpass\.b = "),
+    ({"lowpass": {"cutoff_hz": 30.0, "b": [1.0, 0, 0], "a": [1.0, 0, 0]}}, r"outside \[0\.001, 25"),
+    ({"observation": [{"name": "target_joint_pos", "size": 12}]}, "needs a motion, and there is"),
+    ({"observation": [{"name": "joint_pos", "size": 12, "ahead": 2}]}, "ahead = 2 is outside"),
+    ({"motion": {"frame_dt": 0.02, "frames": [[0.0] * 19]}}, "has 1 frames, need at least 2"),
+    (
+        {"motion": {"frame_dt": 0.02, "frames": [[0.0] * 7] * 2}},
+        r"frames\[0\] has 7 numbers for 19",
+    ),
+    ({"motion": {"frame_dt": 0.02, "frames": 3}}, "frames = 3 is int"),
 ]
 
 

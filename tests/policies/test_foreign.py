@@ -167,59 +167,10 @@ def test_a_memory_restarts_with_its_world() -> None:
     np.testing.assert_array_equal(memory.previous[:, 0], [0.0, 2.0])
 
 
-def test_a_joystick_policy_trots_in_biped(
-    env: VectorEnv, graphs: SimpleNamespace, tmp_path: Path
-) -> None:
-    """Built from the scripted trot by supervised learning; asked for one row at a time."""
-    contract = ready.LEGGED_GYM_48
-    path = graphs.save(
-        tmp_path / "a1.onnx", graphs.mlp("obs", "actions"), {"obs": [1, 48]},
-        {"actions": [1, 12]}, graphs.clone(contract),
-    )  # fmt: skip
-    source = resolve_policy(str(path), CONFIG, terms=Terms("legged_gym_48", "1,0,0"))
-    data, means = collect(env, source.policy, KEY, 60, max_clipped=0.2)
-    assert data.obs.shape == (60, 101)
-    assert "clipped" not in means
-    assert "20 Hz" in source.notes[1]
-    cycle = graphs.outputs(contract)
-    gait = (np.array(contract.default_pose) + cycle * 0.25)[:, contract.joint_order(A1)]
-    expected = (gait - A1.default_pose) / A1.action_half_range
-    late = data.action[20:40].reshape(-1, 12)  # steps 10 to 19 of both worlds
-    apart = np.abs(late[:, None] - expected[None]).max(axis=2)
-    assert apart.min(axis=1).max() < 0.2  # every action is one of the gait's eight
-    assert set(apart.argmin(axis=1)) == set(range(8))
-
-
-def lstm(graphs: SimpleNamespace, path: Path, rows: int | str = 1) -> Path:
-    """Write a recurrent policy as rsl_rl exports it: obs, h_in, c_in -> actions, h_out, c_out."""
-    rng = np.random.default_rng(1)
-    weights = {
-        "w": rng.standard_normal((1, 32, 48)).astype(np.float32) / 8,
-        "r": rng.standard_normal((1, 32, 8)).astype(np.float32) / 8,
-        "axes": np.array([0]),
-        "one": np.array([1]),
-        "w2": rng.standard_normal((8, 12)).astype(np.float32) / 8,
-    }
-    nodes = [
-        helper.make_node("Unsqueeze", ["obs", "axes"], ["x"]),
-        helper.make_node(
-            "LSTM", ["x", "w", "r", "", "", "h_in", "c_in"], ["seq", "h_out", "c_out"],
-            hidden_size=8,
-        ),
-        helper.make_node("Squeeze", ["h_out", "axes"], ["h"]),
-        helper.make_node("MatMul", ["h", "w2"], ["actions"]),
-    ]  # fmt: skip
-    memory: list[int | str] = [1, rows, 8]
-    return graphs.save(
-        path, nodes, {"obs": [rows, 48], "h_in": memory, "c_in": memory},
-        {"actions": [rows, 12], "h_out": memory, "c_out": memory}, weights,
-    )  # fmt: skip
-
-
 def test_a_recurrent_graph_keeps_a_memory_for_every_world(
     env: VectorEnv, graphs: SimpleNamespace, tmp_path: Path
 ) -> None:
-    one, many = lstm(graphs, tmp_path / "one.onnx"), lstm(graphs, tmp_path / "many.onnx", "n")
+    one, many = graphs.lstm(tmp_path / "one.onnx"), graphs.lstm(tmp_path / "many.onnx", "n")
     found = []
     for path in (one, many):
         source = resolve_policy(str(path), CONFIG, terms=Terms("go1_joystick"))
@@ -242,28 +193,17 @@ def test_a_recurrent_graph_keeps_a_memory_for_every_world(
 
 @pytest.mark.parametrize("kind", [TensorProto.FLOAT, I64])
 def test_a_graph_with_a_time_step_counts_its_own_steps(
-    kind: int, env: VectorEnv, graphs: SimpleNamespace, tmp_path: Path
+    kind: int, graphs: SimpleNamespace, tmp_path: Path
 ) -> None:
     """A motion tracker: what it does depends on how often it was asked; more outputs than one."""
-    nodes = [
-        helper.make_node("Cast", ["time_step"], ["t"], to=TensorProto.FLOAT),
-        helper.make_node("MatMul", ["obs", "zero"], ["none"]),
-        helper.make_node("Mul", ["t", "small"], ["shift"]),
-        helper.make_node("Add", ["none", "shift"], ["actions"]),
-        helper.make_node("Identity", ["none"], ["joint_pos"]),
-    ]
-    weights = {"zero": np.zeros((48, 12), np.float32), "small": np.array([0.01], np.float32)}
-    path = graphs.save(
-        tmp_path / "tracker.onnx", nodes, {"obs": [1, 48], "time_step": [1, 1]},
-        {"actions": [1, 12], "joint_pos": [1, 12]}, weights, kinds={"time_step": kind},
-    )  # fmt: skip
+    path = graphs.tracker(tmp_path / "tracker.onnx", GO1, kind)
     source = resolve_policy(str(path), CONFIG, terms=Terms("go1_joystick"))
-    state = a_state(2, step=4)  # 0.2 s are 10 steps of 20 ms
-    _, memory = source.policy.act(source.policy.init(state), state, KEY)
-    np.testing.assert_allclose(memory.previous, 0.1, rtol=1e-6)
-    if kind == I64:
-        data, _ = collect(env, source.policy, KEY, 6)
-        assert np.ptp(data.action[:, 0]) > 0.01
+    motion = graphs.teacher(0.7, 0.0, 0.0)
+    for step in (0, 4, 9):  # 0.2 s are 10 steps of 20 ms, and 4 of the motion
+        state = a_state(2, step)
+        action, _ = source.policy.act(source.policy.init(state), state, KEY)
+        target = A1.default_pose + np.asarray(action) * A1.action_half_range
+        np.testing.assert_allclose(target, [motion[step % 8]] * 2, atol=1e-5)
 
 
 @pytest.mark.parametrize("kind", [F16, F64])

@@ -8,6 +8,7 @@ import json
 import shutil
 import threading
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -23,8 +24,10 @@ from twirl_mjx.training.config import TrainConfig
 from twirl_mjx.training.presets import make_config
 from twirl_mjx.training.run import Part
 from twirl_mjx.training.rundir import RunDir
+from twirl_mjx.training.source import check_dropped
 from twirl_mjx.training.state import TrainState
 from twirl_mjx.worlds.make import make_env
+from twirl_mjx.worlds.vector import FAULTS
 
 
 def read_rows(path: Path) -> list[dict[str, str]]:
@@ -188,7 +191,38 @@ def test_a_finished_run_without_checkpoints_is_not_trained_anew(
 
 def test_worlds_that_only_diverge_stop_the_run() -> None:
     with pytest.raises(guards.DivergedError, match="none of 64 transitions was finite"):
-        guards.check_experience(0, 64)
+        guards.check_experience(0, 64, 10_000, "")
+    guards.check_experience(9_900, 10_000, 10_000, "")
+    with pytest.raises(
+        guards.DivergedError,
+        match=r"101 of 5,000 transitions were dropped, more than 1% of the 10,000 of this run; the"
+        " first one because the reward was not finite",
+    ):
+        guards.check_experience(4_899, 5_000, 10_000, "the reward was not finite")
+
+
+def test_a_recording_that_drops_too_much_is_refused() -> None:
+    check_dropped(1, 99, 100, "the action was not finite")
+    with pytest.raises(guards.DivergedError, match=r"^2 of 60 steps .* because the action was"):
+        check_dropped(2, 58, 100, "the action was not finite")
+
+
+def test_a_run_that_drops_too_much_fails_with_count_and_first_cause(
+    stand_config: TrainConfig, whole_run: Path
+) -> None:
+    batch = loop.Batch([Part(stand_config, RunDir(whole_run))], "test")
+    try:
+        states = batch.start()
+        logger: Any = None  # all seeds fail, so nobody is told apart
+        batch.guard(states, logger)
+        assert not batch.note_drops(np.array(0.0))
+        assert batch.note_drops(np.array([4.0]))
+        assert batch.note_drops(np.array(1.0))  # the first one stays the first
+        lost = states.replace(inserted=states.inserted - 2)
+        with pytest.raises(guards.DivergedError, match=r"^2 of 96 .*because the reward was not"):
+            batch.guard(lost, logger)
+    finally:
+        batch.close()
 
 
 def test_finished_run_is_left_alone(stand_config: TrainConfig, whole_run: Path) -> None:
@@ -281,16 +315,21 @@ def test_source_data_are_required(tmp_path: Path) -> None:
     assert not (tmp_path / "x").exists()
 
 
-def test_non_finite_world_never_reaches_the_ring(stand_config: TrainConfig) -> None:
+def test_non_finite_world_never_reaches_the_ring(
+    stand_config: TrainConfig, capfd: pytest.CaptureFixture[str]
+) -> None:
     env = make_env(stand_config)
     train_state = state.init(stand_config, env, jax.random.key(0), None)
     data = train_state.env.data
     poisoned = data.replace(qvel=data.qvel.at[1, 0].set(jnp.nan))
     train_state = train_state.replace(env=train_state.env.replace(data=poisoned))
-    after, result = state.collect_step(stand_config, env, train_state, jax.random.key(1))
+    after, result, fault = state.collect_step(stand_config, env, train_state, jax.random.key(1))
     assert np.asarray(result.invalid).tolist() == [False, True, False, False]
+    assert np.asarray(fault).tolist() == [0, 1, 0, 0]
+    assert FAULTS[1] == "the physical state was not finite"
     assert int(after.inserted) == 3
     assert int(after.replay.online.size) == 3
     rows = ring.gather(after.replay.online, jnp.arange(4))
     assert np.isfinite(np.asarray(rows.next_obs)).all()
     assert np.isfinite(np.asarray(result.obs)).all()
+    assert "WARNING" not in "".join(capfd.readouterr())  # MuJoCo's own words

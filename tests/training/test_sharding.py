@@ -9,6 +9,7 @@ import os
 import subprocess
 import sys
 import textwrap
+from pathlib import Path
 
 import jax
 import pytest
@@ -70,28 +71,18 @@ CHILD = """
 
 SEEDS = """
     mesh = sharding.device_mesh("seeds")
-    check(
-        batch(),
-        sharding.shard_seeds(batch(), mesh),
-        seeds.compile_epoch_seeds(config, env),
-        sharding.compile_epoch_seeds(config, env, mesh),
-        "seeds",
-    )
+    epoch, place = sharding.spread_seeds(config, env, mesh)
+    check(batch(), place(batch()), seeds.compile_epoch_seeds(config, env), epoch, "seeds")
     three = jax.eval_shape(lambda: seeds.init_seeds(config, env, [0, 1, 2], None))
     with pytest.raises(ValueError, match="seeds is 3, not a multiple of the 2 devices"):
-        sharding.shard_seeds(three, mesh)
+        place(three)
     print("the same")
 """
 
 WORLDS = """
     mesh = sharding.device_mesh("worlds")
-    check(
-        single(),
-        sharding.shard_worlds(single(), mesh),
-        state.compile_epoch(config, env),
-        sharding.compile_epoch_worlds(config, env, mesh),
-        "worlds",
-    )
+    epoch, place = sharding.spread_worlds(config, env, mesh)
+    check(single(), place(single()), state.compile_epoch(config, env), epoch, "worlds")
     odd = make_env(config, num_envs=3)
     with pytest.raises(ValueError, match=r"num_envs is 3.*nearest: 4"):
         sharding.ShardedEnv(odd, mesh)
@@ -99,7 +90,22 @@ WORLDS = """
 """
 
 
-def run_child(body: str, engine: str, error: float) -> None:
+PROGRAM = """
+    from twirl_mjx import cli
+    from twirl_mjx.training.program import Program
+
+    words = "train --task stand --preset debug --variant scratch --num-envs 4"
+    words += " --droq.hidden-sizes 32 --warmup-env-steps 64 --epoch-env-steps 64 --runs FOLDER"
+    for count in (1, 2, 3):
+        chosen = ["--name", f"run{count}", "--seeds", *map(str, range(count))]
+        for total in ("128", "256"):  # the second call resumes
+            assert cli.main([*words.split(), *chosen, "--total-env-steps", total]) == 0
+    assert [Program(config, count).idle_devices for count in (1, 2)] == [None, None]
+    print("the same")
+"""
+
+
+def run_child(body: str, engine: str, error: float) -> str:
     """Run a comparison in which numbers may differ by ``error``, relative and absolute.
 
     A device computes for a part of the seeds or worlds; compiled for other sizes, sums round
@@ -107,7 +113,7 @@ def run_child(body: str, engine: str, error: float) -> None:
     """
     code = textwrap.dedent(CHILD) + textwrap.dedent(body)
     child = dict(os.environ)
-    child["XLA_FLAGS"] = "--xla_force_host_platform_device_count=2"
+    child["XLA_FLAGS"] += " --xla_force_host_platform_device_count=2"  # conftest has set it
     done = subprocess.run(
         [sys.executable, "-c", code.replace("ENGINE", engine).replace("ERROR", str(error))],
         env=child,
@@ -118,6 +124,7 @@ def run_child(body: str, engine: str, error: float) -> None:
     )
     assert done.returncode == 0, done.stderr[-3000:]
     assert done.stdout.endswith("the same\n")
+    return done.stdout
 
 
 @pytest.fixture(scope="module")
@@ -128,14 +135,14 @@ def env(stand_config: TrainConfig) -> VectorEnv:
 def test_epochs_keep_the_shapes_of_their_state(stand_config: TrainConfig, env: VectorEnv) -> None:
     """On a mesh of the devices there are; traced, not compiled."""
     single = jax.eval_shape(lambda key: state.init(stand_config, env, key, None), jax.random.key(0))
-    epoch = sharding.compile_epoch_worlds(stand_config, env, sharding.device_mesh("worlds"))
+    epoch, _ = sharding.spread_worlds(stand_config, env, sharding.device_mesh("worlds"))
     after, metrics = jax.eval_shape(epoch, single)
     assert shapes(after) == shapes(single)
     assert {value.shape for value in metrics.values()} == {()}
 
     chosen = list(range(2 * jax.device_count()))
     batch = jax.eval_shape(lambda: seeds.init_seeds(stand_config, env, chosen, None))
-    epoch = sharding.compile_epoch_seeds(stand_config, env, sharding.device_mesh("seeds"))
+    epoch, _ = sharding.spread_seeds(stand_config, env, sharding.device_mesh("seeds"))
     after, metrics = jax.eval_shape(epoch, batch)
     assert shapes(after) == shapes(batch)
     assert {value.shape for value in metrics.values()} == {(len(chosen),)}
@@ -157,3 +164,12 @@ def test_native_on_two_devices(body: str) -> None:
 @pytest.mark.parametrize("body", [SEEDS, WORLDS], ids=["seeds", "worlds"])
 def test_mjx_on_two_devices(body: str) -> None:
     run_child(body, "mjx", 1e-2)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1900)
+def test_a_command_uses_the_devices_there_are(tmp_path: Path) -> None:
+    said = run_child(PROGRAM.replace("FOLDER", str(tmp_path)), "native", 1e-3)
+    refusal = "one device is used: seeds is 3, not a multiple of the 2 devices (nearest: 4)"
+    assert said.count(refusal) == 2  # both calls, of this batch alone
+    assert "one device is used" not in said.replace(refusal, "")

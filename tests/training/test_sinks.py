@@ -233,11 +233,11 @@ def test_a_real_tracker_works_offline(package: str, tmp_path: Path) -> None:
     code = (
         f"import sys; sys.path.insert(0, {str(Path(__file__).parent)!r})\n"
         "import test_sinks; from pathlib import Path\n"
-        f"logger = test_sinks.open_logger(Path({str(tmp_path / 'run')!r}),"
-        f" sinks=test_sinks.resolve([{package!r}]))\n"
-        "logger.log(10, 5, {'q_mean': 2.5}); assert len(logger._chosen) == 1\n"
-        "logger._each_chosen(lambda sink: sink.close()); assert len(logger._chosen) == 1\n"
+        f"(sink,) = test_sinks.resolve([{package!r}])\n"
+        f"sink.open(test_sinks.make_info(Path({str(tmp_path / 'run')!r}), None))\n"
+        "sink.log(10, 5, 0.1, {'q_mean': 2.5}); sink.close()\n"
     )
+    (tmp_path / "run").mkdir()
     kept = tmp_path / "trackio"
     environment = {
         **os.environ, "WANDB_MODE": "offline", "HF_HUB_OFFLINE": "1", "TRACKIO_DIR": str(kept),

@@ -100,7 +100,8 @@ def test_what_cannot_be_shown_is_refused(
         (["nowhere.npz", "--html", "a.html"], "no policy at nowhere.npz"),
         (["--html", "a.txt"], "nearest: a.html"),
         (["--shift", "icey"], "nearest: 'icy'"),
-        (["my.py:policy"], "nearest: twirl view my.py:policy --html"),
+        (["my.py:policy", "--task", "biped"], "there is no file my.py"),
+        (["trot"], "give one of stand, biped"),
         (["imitate.npz", "--task", "imitate"], "no policy at"),
     ],
 )

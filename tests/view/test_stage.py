@@ -124,7 +124,7 @@ def test_hurdles_have_their_own_sliders() -> None:
     assert [band["pose"][0] for band in bands[:3]] == [3.0, 6.0, 9.0]
     assert bands[0]["size"] == [0.1, 20.0, 0.025]
     assert frame["goal"] == [3.0, 0.0, 0.0] and not frame["goalMoves"]
-    with pytest.raises(ValueError, match="hurdles are the goal"):
+    with pytest.raises(ValueError, match="goal of task hurdles stays"):
         stage.do("goal", [1.0, 0.0])
     with pytest.raises(ValueError, match="bump_height does nothing in task hurdles"):
         stage.do("bump_height", 0.05)
@@ -168,13 +168,13 @@ def test_a_policy_that_changes_on_disk_is_shown(
 
 def test_policies_are_chosen_and_those_that_do_not_fit_refused(tmp_path: Path) -> None:
     odd = zero_policy(tmp_path / "odd.npz", "biped", 95)
-    other = zero_policy(tmp_path / "other.npz", "imitate", 101)
+    other = zero_policy(tmp_path / "other.npz", "walk", 101)
     good = zero_policy(tmp_path / "good.npz", "stand", 101)
     actors = {"good": Actor(good), "odd": Actor(odd), "other": Actor(other)}
     stage = Stage(actors | {"as biped": Actor(good, "biped")}, config=IDEAL)
     for name, message in (
         ("odd", r"expected \[..., 95\]"),
-        ("other", "cannot rehearse task 'imitate'; choose one of stand, biped, hurdles"),
+        ("other", "walk"),
         ("none", "unknown policy 'none'"),
     ):
         with pytest.raises(ValueError, match=message):

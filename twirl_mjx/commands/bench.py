@@ -61,6 +61,8 @@ class AllBench:
     """All results."""
     page: Path = Path("docs/performance.md")
     """Markdown page whose marked section is replaced."""
+    overwrite: bool = False
+    """Replace a file that this command did not write."""
 
     def __post_init__(self) -> None:
         """Check the numbers.
@@ -106,10 +108,11 @@ def _all(argv: list[str]) -> int:
 
     options = parse(AllBench, argv, "twirl bench")
     page = files.read_text(options.page, "a page with a marked section")
+    files.check_ours(options.out, overwrite=options.overwrite)
     report.replace_section(page, "")  # refuses a page without markers before anything is measured
     with only_json_on_stdout() as out:
         results = run_parts(options)
-        files.write_json(options.out, results)
+        files.write_json(options.out, results | {"made_by": files.MARK})
         if options.json:
             print(json_text(results), file=out, flush=True)
     parts = results["parts"]

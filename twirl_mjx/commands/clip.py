@@ -1,11 +1,11 @@
-"""``twirl clip make`` and ``twirl clip show``."""
+"""``twirl clip make``, ``twirl clip show`` and ``twirl clip check``."""
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
 import tyro
@@ -16,6 +16,9 @@ from twirl_mjx.checks import check_choice
 from twirl_mjx.commands.console import parse, say
 from twirl_mjx.commands.render import stem_of
 from twirl_mjx.motion.leap_config import LeapConfig
+
+if TYPE_CHECKING:
+    from twirl_mjx.motion.clip import Clip
 
 FRAME_DT = 0.025
 """s between the frames of a film, half speed at 20 frames per second."""
@@ -31,23 +34,49 @@ class MakeOptions:
     """Clip file to write."""
     leap: LeapConfig = dataclasses.field(default_factory=LeapConfig)
     """What the leap shall be like."""
+    overwrite: bool = False
+    """Replace a clip that this command did not write."""
 
 
 @dataclasses.dataclass(frozen=True)
-class ShowOptions:
-    """Draw and render a clip; with several, compare them (the first is drawn as ours)."""
+class CheckOptions:
+    """Check whether clips can be motions of a robot, and say of each what it holds."""
 
     clips: Annotated[tuple[Path, ...], tyro.conf.Positional] = ()
-    """Clip files; the shipped leap by default."""
+    """Clip files (.json, .txt, .npy, .csv); the shipped leap by default."""
+    robot: str = "a1"
+    """Robot that shall move so, by name or file.py:NAME."""
+    clip_robot: str = ""
+    """Robot the clips were recorded on, where it is another one: its feet are followed."""
+    clip_legs: tuple[str, ...] = ()
+    """Order of the legs in the files, FL FR RR RL say; what they say, else FR FL RR RL."""
+    clip_degrees: bool = False
+    """Joint angles are in degrees."""
+    clip_metres: float = 1.0
+    """m per unit of the root position: 0.01 for centimetres."""
+    clip_quaternion: Literal["xyzw", "wxyz"] = "xyzw"
+    """Order of quaternions."""
+    clip_root: Literal["a1", "laikago"] = "a1"
+    """Root frame: x forward and z up, or that of a Laikago."""
+    clip_fps: float = 0.0
+    """Frames per second, instead of what the files say; 0 to keep that."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ShowOptions(CheckOptions):
+    """Draw and render a clip; with several, compare them (the first is drawn as ours)."""
+
     out: Path = Path("runs/clip")
     """Writes <out>.png, <out>-film.mp4 and .png and, for several clips, <out>-compare.png; with or
     without an ending."""
     source: str = ""
     """Where the other clips come from, written into the comparison."""
+    overwrite: bool = False
+    """Replace pictures and films that this command did not write."""
 
 
 def main(argv: list[str], set_up: Callable[[bool], None]) -> int:
-    """Run ``make`` or ``show``.
+    """Run ``make``, ``show`` or ``check``.
 
     Args:
         argv: What to do, and its options.
@@ -55,15 +84,48 @@ def main(argv: list[str], set_up: Callable[[bool], None]) -> int:
     """
     verb, rest = (argv[0], argv[1:]) if argv else ("", [])
     if verb in ("-h", "--help", ""):
-        say("usage: twirl clip {make,show} [options]; `twirl clip make --help` lists them")
+        say("usage: twirl clip {make,show,check} [options]; `twirl clip make --help` lists them")
         return 0 if verb else 2
-    check_choice("clip action", verb, ("make", "show"))
-    return _make(rest, set_up) if verb == "make" else _show(rest, set_up)
+    check_choice("clip action", verb, ("make", "show", "check"))
+    return {"make": _make, "show": _show, "check": _check}[verb](rest, set_up)
+
+
+def _check(argv: list[str], set_up: Callable[[bool], None]) -> int:
+    options = parse(CheckOptions, argv, "twirl clip check")
+    set_up(False)
+    for clip in _read_all(options):
+        speed = np.linalg.norm(np.diff(clip.root_pos[[0, -1], :2], axis=0)) / clip.cycle_duration
+        low, high = clip.root_pos[:, 2].min(), clip.root_pos[:, 2].max()
+        say(
+            f"{clip.name}: a motion of {clip.robot.name}: {clip.num_frames} frames in"
+            f" {clip.cycle_duration:.3g} s, {speed:.3g} m/s, root at {low:.3g} to {high:.3g} m,"
+            f" {clip.loop}"
+        )
+    return 0
+
+
+def _read_all(options: CheckOptions) -> list[Clip]:
+    """Return the clips as motions of the robot; the first that cannot be one is refused."""
+    from twirl_mjx.motion.formats import Conversion
+    from twirl_mjx.motion.retarget import read_motion
+    from twirl_mjx.sim.robots import ROBOTS
+
+    robot = ROBOTS.get(ROBOTS.admit(options.robot))
+    other = ROBOTS.get(ROBOTS.admit(options.clip_robot)) if options.clip_robot else None
+    conversion = Conversion(
+        options.clip_degrees, options.clip_metres, options.clip_quaternion, options.clip_root,
+        options.clip_fps,
+    )  # fmt: skip
+    paths = options.clips or (asset_path("a1", "leap.json"),)
+    try:
+        return [read_motion(path, robot, options.clip_legs, conversion, other) for path in paths]
+    except ValueError as error:  # the gates name the options of the task
+        raise ValueError(str(error).replace("--imitate.clip-", "--clip-")) from error
 
 
 def _make(argv: list[str], set_up: Callable[[bool], None]) -> int:
     options = parse(MakeOptions, argv, "twirl clip make")
-    files.check_target(options.out)
+    files.check_ours(options.out, overwrite=options.overwrite)
     set_up(False)
     from twirl_mjx.motion.formats import write_clip
     from twirl_mjx.motion.leap import make_leap
@@ -79,19 +141,26 @@ def _make(argv: list[str], set_up: Callable[[bool], None]) -> int:
 
 def _show(argv: list[str], set_up: Callable[[bool], None]) -> int:
     options = parse(ShowOptions, argv, "twirl clip show")
+    stem = stem_of(options.out)
+    endings = (
+        ".png",
+        "-film.mp4",
+        "-film.png",
+        *(["-compare.png"] if len(options.clips) > 1 else []),
+    )
+    for ending in endings:
+        files.check_ours(f"{stem}{ending}", overwrite=options.overwrite)
     set_up(True)
     from twirl_mjx.deploy.render import render_episode
     from twirl_mjx.motion import show as show_lib
     from twirl_mjx.motion.clip import configurations
-    from twirl_mjx.motion.formats import read_clip
     from twirl_mjx.sim.scene import Bands, build_scene
 
-    clips = [read_clip(path) for path in options.clips or (asset_path("a1", "leap.json"),)]
-    stem = stem_of(options.out)
+    clips = _read_all(options)
     show_lib.show(clips[0], f"{stem}.png")
     written = [f"{stem}.png"]
     times = np.arange(0.0, 2 * clips[0].cycle_duration, FRAME_DT)
-    model = build_scene(bands=Bands((BAND_X,))).mj_model
+    model = build_scene(robot=clips[0].robot, bands=Bands((BAND_X,))).mj_model
     film = Path(f"{stem}-film")
     written += map(
         str, render_episode(model, configurations(clips[0], times), film, frame_dt=FRAME_DT)

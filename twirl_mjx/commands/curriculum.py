@@ -25,7 +25,10 @@ ADAPTATION_ENV_STEPS = 100_000
 
 @dataclasses.dataclass(frozen=True)
 class CurriculumOptions:
-    """Train a chain unattended: easier tasks first, the target task, then every dynamics shift."""
+    """Train a chain unattended: easier tasks first, the target task, then every dynamics shift.
+
+    With --source the target task starts from that source, and the easier tasks are left out.
+    """
 
     task: str = TrainConfig.task
     """Target task at the heart of the chain."""
@@ -37,6 +40,14 @@ class CurriculumOptions:
     """Folder of all runs."""
     shifts: tuple[str, ...] = PAPER_SHIFTS[1:]
     """Shifts to adapt to."""
+    source: str = ""
+    """Source of the target task instead of the easier ones: whatever twirl train takes."""
+    source_contract: str = ""
+    """How a foreign source meets the robot, by name or file (docs/sources.md)."""
+    source_command: str = ""
+    """What a foreign source is told to do: 0.5,0,0 or towards-goal:0.5."""
+    allow_clipping: bool = False
+    """Record a source although more than 20 % of its joint targets lie outside the action box."""
 
 
 def chain_of(task: str) -> tuple[Link, ...]:
@@ -55,8 +66,8 @@ def plan(options: CurriculumOptions, preset: str) -> list[tuple[str, TrainConfig
     """
     links: list[tuple[str, TrainConfig]] = []
     task = TASKS.admit(options.task)
-    for name, settings in chain_of(task):
-        source = {"source": str(options.runs / links[-1][0])} if links else {}
+    for name, settings in chain_of(task)[-1:] if options.source else chain_of(task):
+        source = {"source": str(options.runs / links[-1][0])} if links else given_source(options)
         config = configure(preset, {**settings, **source, "seed": options.seed}, f"link {name}")
         chained = f"{name}-chain-{preset}-s{options.seed}"
         # The first link is the run of `twirl train`, which may be there already.
@@ -68,10 +79,33 @@ def plan(options: CurriculumOptions, preset: str) -> list[tuple[str, TrainConfig
             config,
             shift=shift,
             source=str(options.runs / target),
+            source_contract="",
+            source_command="",
             total_env_steps=budget,
         )
         links.append((f"{task}-{shift}-chain-{preset}-s{options.seed}", adapted))
     return links
+
+
+def given_source(options: CurriculumOptions) -> dict[str, str | bool]:
+    """Return the settings of the source that was named, none if there was none.
+
+    Raises:
+        ValueError: A contract or a command, and no source that could have one.
+    """
+    terms = {"contract": options.source_contract, "command": options.source_command}
+    if not options.source:
+        for name, value in terms.items():
+            if value:
+                raise ValueError(
+                    f"--source-{name} {value} would do nothing without a foreign source (nearest:"
+                    " --source FILE.onnx)"
+                )
+        return {}
+    said: dict[str, str | bool] = {f"source_{name}": value for name, value in terms.items()}
+    return {"source": options.source, "variant": "twirl", **said} | (
+        {"allow_clipping": True} if options.allow_clipping else {}
+    )
 
 
 def main(argv: list[str]) -> int:

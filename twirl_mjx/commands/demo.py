@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+from twirl_mjx import files
 from twirl_mjx.assets import asset_path
 from twirl_mjx.checks import check_range
 from twirl_mjx.commands.console import parse, say
@@ -27,6 +28,8 @@ class DemoOptions:
     """Also film one episode of each, and write it as a page that replays it."""
     seconds: float = 10.0
     """Longest film."""
+    overwrite: bool = False
+    """Replace films, strips and pages that this command did not write."""
 
 
 def main(argv: list[str], set_up: Callable[[bool], None]) -> int:
@@ -48,6 +51,9 @@ def main(argv: list[str], set_up: Callable[[bool], None]) -> int:
     found = [path for path in shipped if path.is_file()]
     if not found:
         raise FileNotFoundError(f"no policy in {folder}: train one with `twirl train`")
+    for path in found if options.film else ():
+        for ending in (".mp4", ".png", ".html"):
+            files.check_ours(options.out / f"{path.stem}{ending}", overwrite=options.overwrite)
     for path in found:
         _show(path, options)
     if options.film:
@@ -76,8 +82,11 @@ def _show(path: Path, options: DemoOptions) -> None:
     if options.film:
         from twirl_mjx.commands.view import write_recording
 
-        wanted = RenderOptions(str(path), seed=options.seed, seconds=options.seconds)
+        wanted = RenderOptions(
+            str(path), seed=options.seed, seconds=options.seconds, overwrite=options.overwrite
+        )
         recording = record(config, wanted)
-        film(config, recording, options.out / path.stem, wanted.panels)
-        write_recording(options.out / f"{path.stem}.html", config, recording, title=path.stem)
+        film(config, recording, options.out / path.stem, wanted)
+        page = options.out / f"{path.stem}.html"
+        write_recording(page, config, recording, title=path.stem, overwrite=options.overwrite)
     say(f"{path.stem}: {time.monotonic() - began:.0f} s")

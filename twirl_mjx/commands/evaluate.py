@@ -67,6 +67,8 @@ class EvaluateOptions:
     """What foreign policies are told to do: 0.5,0,0 or towards-goal:0.5."""
     allow_clipping: bool = False
     """Score foreign policies without a contract although their outputs leave [-1, 1]."""
+    overwrite: bool = False
+    """Replace a table or a figure that this command did not write."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -96,7 +98,7 @@ def main(argv: list[str]) -> int:
     if twice := [name for name in options.shifts if options.shifts.count(name) > 1]:
         raise ValueError(f"--shifts names {twice[0]} twice: once is enough")
     out = options.out or Path("runs", f"evaluation-{time.strftime('%Y%m%d-%H%M%S')}.csv")
-    check_outputs(out, options.figure)
+    check_outputs(out, options.figure, options.overwrite)
     candidates = resolve_all(options, overrides)
     rows: list[list[object]] = []
     for candidate in candidates:
@@ -108,19 +110,25 @@ def main(argv: list[str]) -> int:
     return 0
 
 
-def check_outputs(out: Path, figure: Path | None) -> None:
+def check_outputs(out: Path, figure: Path | None, overwrite: bool = False) -> None:
     """Check where results go before anything is evaluated.
 
     Raises:
-        ValueError: A folder or a device where a file is meant, or a figure that is no PNG.
+        ValueError: A folder or a device where a file is meant, a figure that is no PNG, or a file
+            that this command did not write.
     """
+    from twirl_mjx.training.rundir import EVAL_COLUMNS
+
     if out.is_dir():
         raise ValueError(f"--out {out} is a folder (nearest: {out / 'evaluation.csv'})")
-    files.check_target(out)
-    if figure is not None and (figure.is_dir() or figure.suffix != ".png"):
+    files.check_ours(out, ",".join(EVAL_COLUMNS), overwrite=overwrite)
+    if figure is None:
+        return
+    if figure.is_dir() or figure.suffix != ".png":
         raise ValueError(
             f"--figure {figure} is no PNG file (nearest: {figure.with_suffix('.png')})"
         )
+    files.check_ours(figure, overwrite=overwrite)
 
 
 def resolve_all(options: EvaluateOptions, overrides: Overrides) -> list[Candidate]:
@@ -131,9 +139,10 @@ def resolve_all(options: EvaluateOptions, overrides: Overrides) -> list[Candidat
         ValueError: A file that is no policy, options of another task, or two policies that the
             table could not tell apart.
     """
-    from twirl_mjx.policies.resolve import Terms, resolve_policy
+    from twirl_mjx.policies.resolve import PLAIN, Terms, resolve_policy, takes_terms
 
     terms = Terms(options.source_contract, options.source_command, options.allow_clipping)
+    foreign = [given for given in options.policies if terms != PLAIN and takes_terms(given)]
     candidates: dict[str, Candidate] = {}
     for given in options.policies:
         run = name_of(given)
@@ -145,7 +154,8 @@ def resolve_all(options: EvaluateOptions, overrides: Overrides) -> list[Candidat
         config = with_overrides(config_of(given, options.task), overrides)
         config = dataclasses.replace(config, course=options.course, engine=options.engine)
         config.make_task()  # refuses options that only the task can judge
-        found = resolve_policy(given, config, terms=terms)
+        its = terms if given in foreign or not foreign else PLAIN  # refused where nobody is foreign
+        found = resolve_policy(given, config, terms=its)
         if found.data is not None:
             raise ValueError(
                 f"{given} is recorded data, which does not act (nearest: the policy behind it)"

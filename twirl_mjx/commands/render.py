@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import numpy as np
 import tyro
 
+from twirl_mjx import files
 from twirl_mjx.checks import check_range
 from twirl_mjx.commands.console import say
 from twirl_mjx.plugins import is_reference
@@ -51,6 +52,8 @@ class RenderOptions:
     """What a foreign policy is told to do: 0.5,0,0 or towards-goal:0.5."""
     allow_clipping: bool = False
     """Show a foreign policy without a contract although its outputs leave [-1, 1]."""
+    overwrite: bool = False
+    """Replace a film or a strip that this command did not write."""
 
     def __post_init__(self) -> None:
         """Check the numbers.
@@ -79,8 +82,9 @@ def main(argv: list[str], set_up: Callable[[bool], None]) -> int:
         config = dataclasses.replace(config, shift=options.shift)
     path = Path(options.policy)
     named = Path("runs") / f"{name_of(options.policy)}-{config.task}"
-    stem = options.out or (path / "episode" if path.is_dir() else named)
-    film(config, record(config, options), stem_of(stem), options.panels)
+    stem = stem_of(options.out or (path / "episode" if path.is_dir() else named))
+    check_film(stem, options)
+    film(config, record(config, options), stem, options)
     return 0
 
 
@@ -103,8 +107,23 @@ def record(config: WorldConfig, options: RenderOptions) -> Recording:
     return record_episode(config, found.policy, seed=options.seed, steps=steps)
 
 
-def film(config: WorldConfig, recording: Recording, stem: Path, panels: int) -> Path:
-    """Write ``<stem>.mp4`` and ``<stem>.png``; return the strip's path."""
+def check_film(stem: Path, options: RenderOptions) -> None:
+    """Check that a film and its strip can be written.
+
+    Raises:
+        FileError: One of them is there and was not written by this project.
+    """
+    for ending in (".mp4", ".png"):
+        files.check_ours(stem.parent / f"{stem.name}{ending}", overwrite=options.overwrite)
+
+
+def film(config: WorldConfig, recording: Recording, stem: Path, options: RenderOptions) -> Path:
+    """Write ``<stem>.mp4`` and ``<stem>.png``; return the strip's path.
+
+    Raises:
+        FileError: As :func:`check_film`.
+    """
+    check_film(stem, options)
     from twirl_mjx.deploy.render import render_episode
     from twirl_mjx.evaluation.record import scene_model
 
@@ -113,7 +132,7 @@ def film(config: WorldConfig, recording: Recording, stem: Path, panels: int) -> 
         recording.qpos,
         stem,
         frame_dt=recording.robot.control_dt,
-        panels=panels,
+        panels=options.panels,
         goals=recording.goals if config.task_type.shows_goal else None,
         captions=captions(config, recording),
     )

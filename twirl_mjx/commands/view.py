@@ -6,7 +6,7 @@ import dataclasses
 import time
 import webbrowser
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 import tyro
@@ -18,8 +18,7 @@ from twirl_mjx.commands.console import parse, say
 from twirl_mjx.commands.render import FILM_SECONDS, RenderOptions, config_of, record
 from twirl_mjx.deploy.conditions import CONTROL_HZ, SHIFTS, RehearsalConfig
 from twirl_mjx.deploy.reference import TASKS
-from twirl_mjx.plugins import is_reference
-from twirl_mjx.policies.learned import BEST_POLICY, LAST_POLICY
+from twirl_mjx.policies.learned import BEST_POLICY, LAST_POLICY, resolve_policy_path
 
 if TYPE_CHECKING:
     import mujoco
@@ -30,8 +29,6 @@ if TYPE_CHECKING:
 
 CALM = RehearsalConfig(latency_ms=0.0, noise=0.0, full_torque_speed=1e6, no_load_speed=2e6)
 """The ideal loop with noise ready at a slider, and a goal 1 m away."""
-GAITS = ("trot", "bound")
-"""Scripted policies that can be rehearsed."""
 MOTIONS = (".json", ".txt", ".npy", ".csv")
 """Endings of clip files."""
 MOTION_DT = 0.025
@@ -49,9 +46,9 @@ class ViewOptions:
     """
 
     policy: Annotated[str, tyro.conf.Positional] = ""
-    """Run directory, policy file (.npz, .onnx), trot or bound; the shipped biped by default. For
-    --html also any other policy that `twirl render` films, a clip, or a trace: an .npz with qpos
-    [T, 19]."""
+    """Run directory, policy file (.npz, .onnx), file.py:function or scripted name; the shipped
+    biped by default. For --html also a policy of a task of your own, a clip, or a trace: an .npz
+    with qpos [T, 19]."""
     html: Path | None = None
     """Write a replay to this file, which opens offline, instead of serving a page."""
     task: str | None = None
@@ -60,6 +57,8 @@ class ViewOptions:
     """Conditions to begin with."""
     seed: int = 0
     """Seed of goals, noise and courses."""
+    overwrite: bool = False
+    """Replace a page that this command did not write."""
     seconds: float = 20.0
     """Longest replay."""
     host: str = "127.0.0.1"
@@ -90,7 +89,7 @@ def main(argv: list[str]) -> int:
     if options.html is not None:
         from twirl_mjx.view.page import check_page
 
-        check_page(options.html)
+        check_page(options.html, overwrite=options.overwrite)
         say(f"wrote {_write(options, options.html)}: open it in any browser")
         return 0
     check_choice("shift", options.shift, tuple(SHIFTS))
@@ -134,29 +133,20 @@ def _cast(options: ViewOptions) -> dict[str, Actor]:
 
     folder = asset_path("policies")
     shipped = {path.stem: Actor(path) for path in sorted(folder.glob("*.npz"))}
-    shipped = {name: actor for name, actor in shipped.items() if name.split("_")[0] in TASKS}
     if not options.policy:
-        first = {"biped": shipped["biped"]._replace(task=options.task)}
-        return first | {k: v for k, v in shipped.items() if k not in first}
-    return _named(options) | {k: v for k, v in shipped.items() if v.policy != Path(options.policy)}
+        first = {"biped": shipped.pop("biped")._replace(task=options.task)}
+        return first | shipped
+    first = _named(options)
+    others = {k: v for k, v in shipped.items() if v.policy != Path(options.policy)}
+    return first | {name: actor for name, actor in others.items() if name not in first}
 
 
 def _named(options: ViewOptions) -> dict[str, Actor]:
     from twirl_mjx.view.stage import Actor
 
     name, path, task = options.policy, Path(options.policy), options.task
-    if name in GAITS:
-        from twirl_mjx.policies import scripted
-
-        gait = {"trot": scripted.TROT, "bound": scripted.BOUND}[name]
-        return {name: Actor(scripted.ClockedGait(gait), task or "biped")}
-    if is_reference(name):
-        raise ValueError(
-            f"{name} acts in compiled worlds, which the live page does without (nearest:"
-            f" twirl view {name} --html view.html)"
-        )
     if not path.is_dir():
-        return {path.stem: Actor(path, task)}
+        return {path.stem: Actor(path if path.is_file() else name, task)}
     _wait_for_policy(path)
     found = {"newest": path / LAST_POLICY, "best": path / BEST_POLICY}
     return {
@@ -174,8 +164,6 @@ def _wait_for_policy(run: Path) -> None:
         while not any(file.is_file() for file in files):
             time.sleep(LOOK_S)
     if not any(file.is_file() for file in files):
-        from twirl_mjx.policies.learned import resolve_policy_path
-
         resolve_policy_path(run)
 
 
@@ -188,33 +176,27 @@ def _write(options: ViewOptions, path: Path) -> Path:
     if Path(name).suffix in MOTIONS:
         return _write_clip(options, path)
     if _is_trace(Path(name)):
-        return _write_trace(Path(name), path)
-    task = options.task or _task_of(name)
-    if task in TASKS and options.shift in SHIFTS and not is_reference(name):
-        return _write_rehearsal(options, task, path)
-    say(f"{name}: task {task} is not rehearsed, so its worlds are compiled")
+        return _write_trace(options, path)
+    from twirl_mjx.policies.resolve import header_of
+
+    header = None if options.task else header_of(name)
+    task = options.task or (header.task if header else None)
+    if task in TASKS and options.shift in SHIFTS:
+        return _write_rehearsal(options, path)
+    say(f"{name}: task {task} under {options.shift} is not rehearsed, so its worlds are compiled")
     return _write_recording(options, path)
 
 
-def _task_of(name: str) -> str | None:
-    """Return the task a policy says it was trained for."""
-    if name in GAITS or is_reference(name):
-        return None
-    from twirl_mjx.policies.learned import load_policy
-
-    return getattr(getattr(load_policy(name), "header", None), "task", None)
-
-
-def _write_rehearsal(options: ViewOptions, task: str, path: Path) -> Path:
+def _write_rehearsal(options: ViewOptions, path: Path) -> Path:
+    from twirl_mjx.deploy.pilots import find_pilot
     from twirl_mjx.deploy.trial import Trial
-    from twirl_mjx.policies.learned import load_policy
+    from twirl_mjx.policies.resolve import PLAIN
     from twirl_mjx.view.page import write_replay
-    from twirl_mjx.view.stage import readouts
+    from twirl_mjx.view.stage import GOAL_TASKS, readouts
 
     config = dataclasses.replace(options.robot, **SHIFTS[options.shift])  # pyright: ignore
-    policy: Any = options.policy
-    acting = _named(options)[policy].policy if policy in GAITS else load_policy(policy)
-    trial = Trial(acting, task, config, np.random.default_rng([options.seed, 0]))
+    pilot, task = find_pilot(options.policy, options.task, None, PLAIN, say)
+    trial = Trial(pilot, task, config, np.random.default_rng([options.seed, 0]))
     qpos, goals, values = [], [], []
     for _ in range(round(options.seconds * CONTROL_HZ)):
         trial.step()
@@ -225,7 +207,12 @@ def _write_rehearsal(options: ViewOptions, task: str, path: Path) -> Path:
         values.append(readouts(trial))
         if trial.cause is not None:
             break
-    ends = {None: "", "fall": "; it fell", "hurdle": "; it touched a hurdle"}
+    ends = {
+        None: "",
+        "fall": "; it fell",
+        "hurdle": "; it touched a hurdle",
+        "lost": "; it lost the clip",
+    }
     return write_replay(
         path,
         trial.model,
@@ -233,7 +220,8 @@ def _write_rehearsal(options: ViewOptions, task: str, path: Path) -> Path:
         title=f"{task}: {Path(options.policy).name}",
         note="rehearsed in C MuJoCo at 1 ms" + ends.get(trial.cause, "; it diverged"),
         frame_dt=1.0 / CONTROL_HZ,
-        goals=np.array(goals) if task != "stand" else None,
+        overwrite=options.overwrite,
+        goals=np.array(goals) if task in GOAL_TASKS else None,
         values={name: [row[name] for row in values] for name in values[0]},
     )
 
@@ -243,10 +231,13 @@ def _write_recording(options: ViewOptions, path: Path) -> Path:
     config = dataclasses.replace(config, shift=options.shift)
     wanted = RenderOptions(options.policy, seed=options.seed, seconds=options.seconds)
     title = f"{config.task}: {Path(options.policy).name}"
-    return write_recording(path, config, record(config, wanted), title=title)
+    recording = record(config, wanted)
+    return write_recording(path, config, recording, title=title, overwrite=options.overwrite)
 
 
-def write_recording(path: Path, config: WorldConfig, recording: Recording, *, title: str) -> Path:
+def write_recording(
+    path: Path, config: WorldConfig, recording: Recording, *, title: str, overwrite: bool = False
+) -> Path:
     """Write a recorded episode as a replay."""
     from twirl_mjx.evaluation.record import scene_model
     from twirl_mjx.view.page import write_replay
@@ -259,6 +250,7 @@ def write_recording(path: Path, config: WorldConfig, recording: Recording, *, ti
         title=title,
         note=f"{len(recording.reward)} control steps of the training simulation",
         frame_dt=recording.robot.control_dt,
+        overwrite=overwrite,
         goals=recording.goals if config.task_type.shows_goal else None,
         values={"return": np.cumsum(recording.reward).tolist()} | shown,
     )
@@ -278,6 +270,7 @@ def _write_clip(options: ViewOptions, path: Path) -> Path:
         qpos,
         title=f"clip {Path(options.policy).name}",
         frame_dt=MOTION_DT,
+        overwrite=options.overwrite,
         values={"root height (m)": qpos[:, 2].tolist()},
     )
 
@@ -288,10 +281,11 @@ def _is_trace(path: Path) -> bool:
     return "qpos" in array_files.names_in_npz(path, "a policy or a trace")
 
 
-def _write_trace(trace: Path, path: Path) -> Path:
+def _write_trace(options: ViewOptions, path: Path) -> Path:
     """Write a trace: ``qpos`` [T, 19], and if it likes ``goals`` [T, 2] and ``frame_dt`` (s)."""
     from twirl_mjx.view.page import write_replay
 
+    trace = Path(options.policy)
     arrays = array_files.read_npz(trace, "a trace")
     frame_dt = float(arrays.get("frame_dt", np.array(1.0 / CONTROL_HZ)))
     check_range(f"frame_dt of {trace}", frame_dt, 1e-4, 10.0)
@@ -302,6 +296,7 @@ def _write_trace(trace: Path, path: Path) -> Path:
         qpos,
         title=f"trace {trace.name}",
         frame_dt=frame_dt,
+        overwrite=options.overwrite,
         goals=arrays.get("goals"),
         values={"root height (m)": qpos[:, 2].tolist()} if qpos.ndim == 2 else {},
     )

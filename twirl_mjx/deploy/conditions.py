@@ -41,6 +41,10 @@ class RehearsalConfig:
     """Standard deviation of the measured joint angles, rad."""
     position_noise: float = 0.005
     """Standard deviation of the estimated base position per reading, m."""
+    velocity_noise: float = 0.05
+    """Standard deviation of the estimated base velocity per axis, m/s; of foreign policies only."""
+    joint_velocity_noise: float = 0.2
+    """Standard deviation of the measured joint velocities, rad/s; of foreign policies only."""
     position_drift: float = 0.01
     """Random walk of the estimated base position, m per square root of a second."""
     noise: float = 1.0
@@ -123,6 +127,8 @@ IDEAL = RehearsalConfig(
     rate_noise=0.0,
     joint_noise=0.0,
     position_noise=0.0,
+    velocity_noise=0.0,
+    joint_velocity_noise=0.0,
     position_drift=0.0,
     full_torque_speed=1e6,
     no_load_speed=2e6,
@@ -140,7 +146,10 @@ SHIFTS: dict[str, dict[str, float | str]] = {
 }
 """The paper's conditions as changes of a config (docs/shifts.md; the weak leg is always the same
 one at its weakest, and motors do not heat)."""
-LIVE = ("latency_ms", "torque_limit", "full_torque_speed", "no_load_speed", "kp", "kd", "weak_leg",
-        "leg_strength", "friction", "gravity", "payload", "orientation_noise", "rate_noise",
-        "joint_noise", "position_noise", "position_drift", "noise", "episode_s")  # fmt: skip
+LIVE = (
+    "latency_ms", "torque_limit", "full_torque_speed", "no_load_speed", "kp", "kd", "weak_leg",
+    "leg_strength", "friction", "gravity", "payload", "orientation_noise", "rate_noise",
+    "joint_noise", "position_noise", "velocity_noise", "joint_velocity_noise", "position_drift",
+    "noise", "episode_s",
+)  # fmt: skip
 """Settings that may change while an episode runs; the others shape the scene or its score."""

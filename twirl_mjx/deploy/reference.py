@@ -13,8 +13,8 @@ import numpy as np
 
 HISTORY = 3
 UPRIGHT_TASKS = ("stand", "biped")
-TASKS = (*UPRIGHT_TASKS, "hurdles")
-"""Tasks that can be rehearsed; ``imitate`` needs its reference motion and is a source only."""
+TASKS = (*UPRIGHT_TASKS, "hurdles", "imitate")
+"""Tasks that can be rehearsed."""
 
 STANDING_COSINE = 0.7
 LIFTED = 0.01
@@ -26,6 +26,7 @@ FALL_PARTS = {
     "stand": ("trunk", "head", "hip", "thigh", "calf"),
     "biped": ("trunk", "head", "hip", "thigh"),
     "hurdles": ("trunk", "head"),
+    "imitate": ("trunk", "head", "hip", "thigh"),
 }
 """Parts of the robot whose ground contact ends an episode (README, "Deviations and decisions")."""
 
@@ -41,6 +42,10 @@ class Reading(NamedTuple):
     """[12] rad."""
     position: np.ndarray
     """[3] m, base in the world frame."""
+    velocity: np.ndarray = np.zeros(3)
+    """[3] m/s, base in the world frame; our own policies do not look at it."""
+    joint_vel: np.ndarray = np.zeros(12)
+    """[12] rad/s; neither at this."""
 
 
 def quaternion_matrix(quat: np.ndarray) -> np.ndarray:
@@ -124,7 +129,7 @@ class Score:
         self,
         qpos: np.ndarray,
         qvel: np.ndarray,
-        front_feet: np.ndarray,
+        feet: np.ndarray,
         goal: np.ndarray,
         ground: float = 0.0,
     ) -> float:
@@ -133,14 +138,14 @@ class Score:
         Args:
             qpos: [19] true state at its end.
             qvel: [18] true velocities at its end.
-            front_feet: [2] m, height of the lowest point of the front feet over the ground.
+            feet: [4] m, height of the lowest point of the feet over the ground, front ones first.
             goal: [2] m, goal of the step.
             ground: height of the ground under the base, m.
 
         Returns:
             The reward.
         """
-        rotation = quaternion_matrix(qpos[3:7])
+        rotation, front_feet = quaternion_matrix(qpos[3:7]), feet[:2]
         cosine = rotation[2, 0]
         if cosine >= STANDING_COSINE and (front_feet > LIFTED).all():
             self.standing_steps += 1
@@ -161,6 +166,14 @@ class Score:
         self.min_distance = min(self.min_distance, distance)
         self.reward_sum += float(reward)
         return float(reward)
+
+    def cause(self) -> str | None:
+        """Return why the state just scored ends the episode, None where it goes on."""
+        return None
+
+    def extra(self, steps: int) -> dict[str, float]:
+        """Return what only this task measures, after ``steps`` control steps."""
+        return {"hurdles_passed": float(self.passed)} if self.task == "hurdles" else {}
 
     def _rewards_front_feet(self) -> bool:
         return self.task == "stand" and self.height_of == "front_feet"

@@ -16,6 +16,8 @@ LEGS = ("FR", "FL", "RR", "RL")
 POSE = np.tile([0.0, 0.9, -1.8], 4)
 SWING = np.tile([0.6, 1.2, 1.2], 4)
 LOWER = np.tile([-0.802851455917, -1.0471975512, -2.69653369433], 4)
+KNEE_RADIUS = 0.015
+"""m, of the calf at the knee."""
 UPPER = np.tile([0.802851455917, 4.18879020479, -0.916297857297], 4)
 
 
@@ -76,6 +78,7 @@ class Sensors:
 
     def __init__(self, config: RehearsalConfig, rng: np.random.Generator) -> None:
         self.config, self._rng = config, rng
+        self._more = rng.spawn(1)[0]  # what is drawn for foreign policies changes nothing else
         self._drift = np.zeros(3)
 
     def read(self, data: mujoco.MjData) -> Reading:
@@ -84,6 +87,9 @@ class Sensors:
 
         def normal(size: int) -> np.ndarray:
             return c.noise * self._rng.standard_normal(size)
+
+        def more(size: int) -> np.ndarray:
+            return c.noise * self._more.standard_normal(size)
 
         self._drift += c.position_drift / np.sqrt(CONTROL_HZ) * normal(3)
         turn = c.orientation_noise * normal(3)
@@ -94,6 +100,8 @@ class Sensors:
             angular_velocity=data.qvel[3:6] + c.rate_noise * normal(3),
             joint_pos=data.qpos[7:19] + c.joint_noise * normal(12),
             position=data.qpos[:3] + self._drift + c.position_noise * normal(3),
+            velocity=data.qvel[:3] + c.velocity_noise * more(3),
+            joint_vel=data.qvel[6:18] + c.joint_velocity_noise * more(12),
         )
 
 
@@ -107,12 +115,16 @@ class Contacts:
         )
         self._band = np.array([name.startswith("hurdle_") for name in names])
         self._watched = self._fall | self._band
+        knees = range(model.nbody) if task == "imitate" else ()
+        self._knees = [i for i in knees if model.body(i).name.endswith("_calf")]
 
     def cause(self, data: mujoco.MjData) -> str | None:
         """Return ``hurdle``, ``fall`` or, when the episode goes on, ``None``.
 
         The robot does not touch itself, so every contact has one geom of the ground.
         """
+        if self._knees and data.xpos[self._knees, 2].min() <= KNEE_RADIUS:
+            return "fall"
         pairs = data.contact.geom
         if not self._watched[pairs].any():
             return None

@@ -1,8 +1,8 @@
 """One episode of a policy in the rehearsal's loop, one control step at a time.
 
 Nothing of the training simulation runs here. C MuJoCo advances at 1 ms with every body part
-colliding; a 20 Hz loop reads noisy sensors (``deploy.robot``), builds the observation
-(``deploy.reference``), asks the policy, filters the command and, a latency later, hands joint
+colliding; a 20 Hz loop reads noisy sensors (``deploy.robot``), lets a pilot observe
+and decide (``deploy.pilots``), filters the command and, a latency later, hands joint
 targets to motors with a PD law and a torque-speed limit.
 """
 
@@ -10,29 +10,36 @@ from __future__ import annotations
 
 import dataclasses
 from collections import deque
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
 
 from twirl_mjx.deploy.conditions import CONTROL_HZ, LIVE, RehearsalConfig
 from twirl_mjx.deploy.ground import build_model, ground_height, set_conditions
-from twirl_mjx.deploy.reference import Observer, Score
+from twirl_mjx.deploy.imitation import FollowScore
+from twirl_mjx.deploy.pilots import Pilot
+from twirl_mjx.deploy.reference import Reading, Score
 from twirl_mjx.deploy.robot import CommandFilter, Contacts, Sensors, motor_shares, motor_torque
 
 BANDS = 24
 """Hurdle bands laid out: more than 20 s at 2 m/s can reach."""
-FRONT_FEET = ("FR_foot", "FL_foot")
-FEET = (*FRONT_FEET, "RR_foot", "RL_foot")
+FEET = ("FR_foot", "FL_foot", "RR_foot", "RL_foot")
+ROUNDING = 1e-3
+"""By which an action may leave [-1, 1] and not count as clipped."""
 
 
 class Decision(NamedTuple):
     """What a policy was given at a control step, and what it answered."""
 
+    reading: Reading
+    """What was measured."""
     observation: np.ndarray
-    """[O]."""
+    """[O] what the policy was given; of a foreign one, what the task would have shown."""
     action: np.ndarray
-    """[A] in [-1, 1]."""
+    """[12] in [-1, 1]."""
+    target: np.ndarray
+    """[12] rad, the joint target that followed, filtered and within the limits."""
 
 
 @dataclasses.dataclass
@@ -107,44 +114,56 @@ class Trial:
     """
 
     def __init__(
-        self, policy: Any, task: str, config: RehearsalConfig, rng: np.random.Generator
+        self, pilot: Pilot, task: str, config: RehearsalConfig, rng: np.random.Generator
     ) -> None:
         """Draw the course and place the robot.
 
         Args:
-            policy: ``act(obs [O]) -> action [A]``; ``reset()`` is called first when it has one.
+            pilot: what decides.
             task: one of ``reference.TASKS``.
             config: conditions.
             rng: draws goal, hurdles and noise.
+
+        Raises:
+            ValueError: Ground on which the task is not rehearsed.
         """
-        if hasattr(policy, "reset"):
-            policy.reset()
-        self.policy, self.task, self.config = policy, task, config
+        if task == "imitate" and (config.bump_height or config.incline_deg):
+            raise ValueError(
+                "task imitate is rehearsed on flat ground only (nearest: bump_height 0,"
+                " incline_deg 0)"
+            )
+        self.pilot, self.task, self.config = pilot, task, config
         self.hurdles = draw_hurdles(config, rng) if task == "hurdles" else np.zeros(0)
         self._drawn = draw_goal(config, rng)
         self.model = build_model(config, self.hurdles)
         self.data = mujoco.MjData(self.model)
         mujoco.mj_resetDataKeyframe(self.model, self.data, self.model.key("home").id)
         mujoco.mj_forward(self.model, self.data)
-        self._feet = [self.model.geom(name).id for name in FRONT_FEET]
+        self._feet = [self.model.geom(name).id for name in FEET]
         self._raise_to_ground()
         self._sensors, self._contacts = Sensors(config, rng), Contacts(self.model, task)
         self.drive = Drive(np.zeros(self.model.nu), np.zeros(self.model.nu))
-        self.score = Score(task, self.hurdles, config.height_of)
+        self.score = self._new_score()
         self.score.start(self.data.qpos[:3], self.goal)
         self._reading = self._sensors.read(self.data)
-        self._observer = Observer(task, self._reading)
-        self._command = CommandFilter(self.data.qpos[7:])
+        pilot.reset(self._reading)
+        self._command = CommandFilter(self._reading.joint_pos)  # a robot knows what it measures
         self._targets = deque([(0, self.data.qpos[7:].copy())])
-        self.steps, self._travelled = 0, 0.0
+        self.steps, self._travelled, self._clipped = 0, 0.0, 0.0
         self.cause: str | None = None
-        """Why it ended: ``fall``, ``hurdle`` or ``diverged``; None while it goes on."""
+        """Why it ended: ``fall``, ``hurdle``, ``lost`` or ``diverged``; None while it goes on."""
+
+    def _new_score(self) -> Score:
+        if self.task == "imitate":
+            return FollowScore(
+                self.task, self.hurdles, clip=self.pilot.clip, options=self.pilot.options
+            )
+        return Score(self.task, self.hurdles, self.config.height_of)
 
     def _raise_to_ground(self) -> None:
         """Lift the robot by the highest ground under a foot, on bumps."""
         if self.config.bump_height:
-            feet = [self.model.geom(name).id for name in FEET]
-            under = ground_height(self.config, self.data.geom_xpos[feet, :2])
+            under = ground_height(self.config, self.data.geom_xpos[self._feet, :2])
             self.data.qpos[2] += under.max()
             mujoco.mj_forward(self.model, self.data)
 
@@ -179,27 +198,30 @@ class Trial:
         self.config = self._sensors.config = config
         set_conditions(self.model, config)
 
-    def observe(self) -> np.ndarray:
-        """Return what the policy is about to be given, [O] float32."""
-        return self._observer.observe(self._reading, self.goal)
+    def decide(self) -> tuple[np.ndarray, np.ndarray]:
+        """Ask the pilot: return the task's observation [O] and the action [12], unclipped."""
+        return self.pilot.decide(self._reading, self.goal)
 
     def step(self) -> Decision:
         """Advance by one control step of 0.05 s, of an episode that has not ended."""
-        goal = self.goal
-        obs = self.observe()
-        action = np.clip(self.policy.act(obs), -1.0, 1.0)
+        goal, reading = self.goal, self._reading
+        obs, wanted = self.decide()
+        action = np.clip(wanted, -1.0, 1.0)
+        self._clipped += float(np.mean(np.abs(wanted) > 1.0 + ROUNDING))
+        target = self._command(action)
         start = self.steps * self.config.n_substeps + self.config.latency_steps
-        self._targets.append((start, self._command(action)))
+        self._targets.append((start, target))
         self.cause = advance(
             self.model, self.data, self.config, self._targets, self._contacts, self.drive
         )
         if self.cause != "diverged":
             self._judge(goal)
+            self.cause = self.cause or self.score.cause()
             self._travelled = float(self.data.qpos[0])
             self._reading = self._sensors.read(self.data)
-            self._observer.push(self._reading, action)
+            self.pilot.push(self._reading, action)
         self.steps += 1
-        return Decision(obs, action)
+        return Decision(reading, obs, action, target)
 
     def _judge(self, goal: np.ndarray) -> None:
         feet = self.data.geom_xpos[self._feet]
@@ -226,6 +248,7 @@ class Trial:
             "peak_torque": float(self.drive.peak.max()),
             "mean_power": float(self.drive.work.sum()) / seconds,
         }
-        if self.task == "hurdles":
-            metrics["hurdles_passed"] = float(score.passed)
-        return metrics
+        if self.task == "imitate":  # it has no goal and nobody stands up
+            for name in ("standing_time", "min_distance", "final_distance"):
+                del metrics[name]
+        return metrics | score.extra(self.steps) | {"clipped": self._clipped / self.steps}

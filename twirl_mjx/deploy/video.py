@@ -80,7 +80,8 @@ def _start_encoder(path: Path, width: int, height: int, fps: int) -> subprocess.
     import imageio_ffmpeg
 
     source = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", str(fps)]
-    target = ["-an", "-c:v", "libx264", "-crf", "21", "-pix_fmt", "yuv420p"]
+    mark = ["-metadata", f"comment={files.MARK}"]
+    target = ["-an", *mark, "-c:v", "libx264", "-crf", "21", "-pix_fmt", "yuv420p"]
     return subprocess.Popen(
         [
             imageio_ffmpeg.get_ffmpeg_exe(),
@@ -118,12 +119,16 @@ def strip_indices(count: int, panels: int) -> list[int]:
 def write_strip(path: str | Path, frames: Sequence[np.ndarray], gap: int = 4) -> Path:
     """Write frames [H, W, 3] side by side as one wide PNG, ``gap`` white pixels between."""
     from PIL import Image
+    from PIL.PngImagePlugin import PngInfo
 
     path = Path(path)
     if path.suffix != ".png" or not len(frames):
         raise ValueError(f"{path}: a strip needs a .png name and at least one frame")
     spacer = np.full((frames[0].shape[0], gap, 3), 255, np.uint8)
     parts = [part for frame in frames for part in (spacer, frame)][1:]
+    about = PngInfo()
+    about.add_text("Software", files.MARK)
     with files.write_atomic(path) as file:
-        Image.fromarray(np.concatenate(parts, axis=1)).save(file, "png", optimize=True)
+        picture = Image.fromarray(np.concatenate(parts, axis=1))
+        picture.save(file, "png", optimize=True, pnginfo=about)
     return path

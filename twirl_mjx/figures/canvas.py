@@ -19,6 +19,7 @@ from matplotlib.font_manager import FontProperties
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 from PIL import Image
 from PIL.Image import Dither, Quantize
+from PIL.PngImagePlugin import PngInfo
 
 from twirl_mjx import files
 from twirl_mjx.figures.style import Theme, rc_params, short_count, theme_of
@@ -134,7 +135,9 @@ def png_bytes(figure: Figure) -> bytes:
     with Image.open(io.BytesIO(_encode(figure, "png", {"Software": None}))) as picture:
         small = picture.convert("RGB").quantize(256, Quantize.MEDIANCUT, dither=Dither.NONE)
     buffer = io.BytesIO()
-    small.save(buffer, format="png")
+    about = PngInfo()
+    about.add_text("Software", files.MARK)
+    small.save(buffer, format="png", pnginfo=about)
     return buffer.getvalue()
 
 

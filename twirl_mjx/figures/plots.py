@@ -8,14 +8,15 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 
+from twirl_mjx import files
 from twirl_mjx.figures.aggregate import statistics_of
 from twirl_mjx.figures.bars import ablation, shift_bars
 from twirl_mjx.figures.canvas import write_png
-from twirl_mjx.figures.cells import lead_metrics, ordered, shown_metrics
+from twirl_mjx.figures.cells import groups, lead_metrics, ordered, shown_metrics
 from twirl_mjx.figures.curves import learning_curves
 from twirl_mjx.figures.errors import TableError
 from twirl_mjx.figures.facts import read_facts
-from twirl_mjx.figures.tables import Table, read_directory
+from twirl_mjx.figures.tables import Table, mask, read_directory
 
 __all__ = ["Drawing", "ablation", "drawings", "learning_curves", "make_figures", "read_grids"]
 __all__ += ["shift_bars"]
@@ -45,6 +46,7 @@ def read_grids(
     Args:
         results_dir: ``experiments/results``.
         say: Called with one line per grid that is left out.
+        overwrite: Whether pictures may be replaced that this did not write.
 
     Returns:
         Grid -> (curve rows, episode rows), in the order of ``place``, then of names; None where
@@ -73,8 +75,9 @@ def drawings(grid: str, curves: Table | None, episodes: Table | None) -> Iterato
     """Yield the figures of one grid: every measure that its rows hold.
 
     Curves with settings become one effect per setting that varies, other curves learning curves
-    and, where there are several shifts, bars; episodes become bars. What leads a task is drawn in
-    the paper's style (mean and deviation) as well.
+    (of what is measured at two moments or more) and, where there are several shifts, bars;
+    episodes become bars. What leads a task is drawn in the paper's style (mean and deviation) as
+    well.
 
     Args:
         grid: Name of the grid.
@@ -96,6 +99,8 @@ def drawings(grid: str, curves: Table | None, episodes: Table | None) -> Iterato
         for kind, column in kinds:
             words = [start, kind, *([_slug(column)] if several else [])]
             for metric in metrics:
+                if kind == "curves" and metric not in leads and not _is_curve(table, metric):
+                    continue
                 shown = statistics_of(table.facts, metric)
                 for statistic in shown if metric in leads else shown[-1:]:
                     name = "_".join([*words, _slug(metric), statistic])
@@ -103,7 +108,11 @@ def drawings(grid: str, curves: Table | None, episodes: Table | None) -> Iterato
 
 
 def make_figures(
-    results_dir: str | Path, output_dir: str | Path, say: Callable[[str], None] = print
+    results_dir: str | Path,
+    output_dir: str | Path,
+    say: Callable[[str], None] = print,
+    *,
+    overwrite: bool = False,
 ) -> list[Path]:
     """Draw every figure of every grid as PNG.
 
@@ -111,19 +120,23 @@ def make_figures(
         results_dir: ``experiments/results``, with ``<grid>/<arm>.csv`` below it.
         output_dir: Directory of the pictures, made if needed.
         say: Called with one line per grid that is left out.
+        overwrite: Whether pictures may be replaced that this did not write.
 
     Returns:
         The files written, ``<output_dir>/<grid>_<kind>_<metric>_<statistic>.png``.
 
     Raises:
         TableError: If a table is not valid.
+        FileError: A picture is there that this did not write; nothing is drawn then.
     """
-    paths = []
-    for grid, (curves, episodes) in read_grids(results_dir, say).items():
-        for drawing in drawings(grid, curves, episodes):
-            path = Path(output_dir) / f"{drawing.name}.png"
-            paths.append(write_png(drawing.draw("light"), path))
-    return paths
+    wanted = [
+        (drawing, Path(output_dir) / f"{drawing.name}.png")
+        for grid, (curves, episodes) in read_grids(results_dir, say).items()
+        for drawing in drawings(grid, curves, episodes)
+    ]
+    for _, path in wanted:
+        files.check_ours(path, overwrite=overwrite)
+    return [write_png(drawing.draw("light"), path) for drawing, path in wanted]
 
 
 def _kinds(table: Table) -> list[tuple[str, str]]:
@@ -134,6 +147,12 @@ def _kinds(table: Table) -> list[tuple[str, str]]:
     if varied:
         return [("ablation", column) for column in varied]
     return [("curves", ""), *([("bars", "")] if len(ordered(table, "shift")) > 1 else [])]
+
+
+def _is_curve(table: Table, metric: str) -> bool:
+    """Return whether any run reports a metric at two moments, not at its close alone."""
+    rows = mask(table, table["metric"] == metric)
+    return any(len(set(run["env_steps"].tolist())) > 1 for run in groups(rows, ["run"]).values())
 
 
 def _drawing(

@@ -275,6 +275,7 @@ def write_clip(clip: Clip, path: str | Path, layout: Layout = "peng") -> None:
         columns += _derived(clip)
     rows = np.concatenate(columns, axis=1)
     head = {
+        "MadeBy": files.MARK,
         "LoopMode": {mode: name for name, mode in LOOP_MODES.items()}[clip.loop],
         "FrameDuration": clip.frame_duration,
         "EnableCycleOffsetPosition": clip.cycle_offset_position,

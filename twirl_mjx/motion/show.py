@@ -137,5 +137,8 @@ def _save(figure: matplotlib.figure.Figure, path: Path) -> None:
     for text in figure.findobj(matplotlib.text.Text):
         text.set_parse_math(False)
         text.set_text(text.get_text().encode(errors="replace").decode())
+    kind = path.suffix.removeprefix(".") or "png"
+    about = {"png": {"Software": files.MARK}, "pdf": {"Creator": files.MARK}}
+    about["svg"] = about["pdf"]
     with files.write_atomic(path) as file:
-        figure.savefig(file, format=path.suffix.removeprefix(".") or "png", dpi=150)
+        figure.savefig(file, format=kind, dpi=150, metadata=about.get(kind))

@@ -63,8 +63,14 @@ VOCABULARY: dict[str, Word] = {
     "goal_displacement_w": Word(2, "m", "from the base to the task's goal, world frame"),
     "base_x_axis_w": Word(3, "1", "forward axis of the base, world frame"),
     "base_z_axis_w": Word(3, "1", "upward axis of the base, world frame"),
+    "base_quat_h": Word(4, "1", "orientation of the base without its yaw, w x y z, w >= 0"),
+    "target_base_displacement_h": Word(3, "m", "from the base to that of the motion, heading"),
+    "target_base_quat_h": Word(4, "1", "orientation of the motion's base, seen from the heading"),
+    "target_joint_pos": Word("joints", "rad", "joint angles of the motion"),
 }
-"""Every term that ``meeting`` can fill."""
+"""Every term that ``meeting`` can fill; heading: the world turned by the base's yaw."""
+OF_MOTION = "target_"
+"""How the words begin that show a contract's motion."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -81,6 +87,8 @@ class Term:
     """Lowest and highest number shown, after scaling."""
     history: int = 1
     """Control steps shown; before the first one, the first one repeated."""
+    ahead: int = 0
+    """Control steps from now, of a word about the motion."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -103,6 +111,42 @@ class Gains:
     """N m/rad."""
     kd: Numbers
     """N m s/rad."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Lowpass:
+    """A second-order filter on the joint targets, at rest at the measured angles at reset.
+
+    ``y = b0 x + b1 x' + b2 x" - a1 y' - a2 y"``, once per control step; information, the target
+    world has its own.
+    """
+
+    cutoff_hz: float
+    """Hz."""
+    b: tuple[float, float, float]
+    """Of the targets: now, one and two steps ago."""
+    a: tuple[float, float, float]
+    """Of what came out, the first one 1."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Motion:
+    """A motion that a policy was trained to follow, cycle after cycle.
+
+    Its clock starts at reset; then, and whenever a cycle begins, the motion is moved to where the
+    base is (x and y).
+    """
+
+    frame_dt: float
+    """s between frames; the last frame is the first one of the next cycle."""
+    frames: tuple[tuple[float, ...], ...]
+    """[F, 7 + J] position in m, orientation w x y z, rad in the order of ``joints``."""
+    start: float = 0.0
+    """s, time within the motion at reset."""
+    travels: bool = True
+    """Whether a cycle begins at the (x, y) where the last one ended."""
+    turns: bool = False
+    """Whether it begins with the heading with which the last one ended."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -139,8 +183,15 @@ class Contract:
     """Robots it was made for."""
     facts_from: str = ""
     """Where the numbers were published."""
-    cutoff_hz: float = 0.0
-    """Hz, low-pass on the joint targets (second-order Butterworth); 0 for none. Information."""
+    lowpass: Lowpass | None = None
+    """What the joint targets pass on their way to the motors."""
+    joint_limits: tuple[tuple[float, float], ...] = ()
+    """[J] rad, (low, high), to which targets are clipped after the low-pass; empty for none.
+    Information."""
+    torque_limit: Numbers | None = None
+    """N m. Information."""
+    motion: Motion | None = None
+    """What the words that begin with ``target_`` show."""
 
     def __post_init__(self) -> None:
         """Check names, sizes and ranges.
@@ -221,16 +272,50 @@ def _check(contract: Contract) -> None:
     _check_numbers("commands", contract.commands, len(contract.commands), "commands")
     _check_numbers("gait_offsets", contract.gait_offsets, len(contract.gait_offsets), "clocks")
     check_range("gait_period (s)", contract.gait_period, 0.0, 100.0)
-    check_range("cutoff_hz", contract.cutoff_hz, 0.0, 1000.0)
-    if contract.gains is not None:
-        _check_numbers("gains.kp", contract.gains.kp, joints, "joints")
-        _check_numbers("gains.kd", contract.gains.kd, joints, "joints")
+    _check_information(contract, joints)
     names = [name for pair in contract.memory for name in pair]
     if any(len(pair) != 2 for pair in contract.memory) or len(set(names)) != len(names):
         raise ValueError(f"memory is {contract.memory}: need pairs of different names (in, out)")
     for index, term in enumerate(contract.observation):
         _check_term(contract, term, f"observation[{index}] {term.name!r}")
     _check_frames(contract)
+    _check_motion(contract, joints)
+
+
+def _check_motion(contract: Contract, joints: int) -> None:
+    shown = [term.name for term in contract.observation if term.name.startswith(OF_MOTION)]
+    if (motion := contract.motion) is None:
+        if shown:
+            raise ValueError(f"observation term {shown[0]!r} needs a motion, and there is none")
+        return
+    check_range("motion.frame_dt (s)", motion.frame_dt, 1e-4, 1.0)
+    if len(motion.frames) < 2:
+        raise ValueError(f"motion.frames has {len(motion.frames)} frames, need at least 2")
+    for index, frame in enumerate(motion.frames):
+        _check_numbers(f"motion.frames[{index}]", frame, 7 + joints, "position to joints")
+    cycle = (len(motion.frames) - 1) * motion.frame_dt
+    check_range("motion.start (s)", motion.start, 0.0, cycle)
+
+
+def _check_information(contract: Contract, joints: int) -> None:
+    if contract.gains is not None:
+        _check_numbers("gains.kp", contract.gains.kp, joints, "joints")
+        _check_numbers("gains.kd", contract.gains.kd, joints, "joints")
+    if contract.torque_limit is not None:
+        _check_numbers("torque_limit", contract.torque_limit, joints, "joints")
+    if contract.joint_limits and len(contract.joint_limits) != joints:
+        raise ValueError(f"joint_limits has {len(contract.joint_limits)} pairs for {joints} joints")
+    for joint, limits in zip(contract.joints, contract.joint_limits, strict=False):
+        _check_limits(f"joint_limits of {joint}", limits)
+    if (lowpass := contract.lowpass) is not None:
+        check_range("lowpass.cutoff_hz", lowpass.cutoff_hz, 0.001, 0.5 / contract.control_dt)
+        _check_numbers("lowpass.b", lowpass.b, 3, "steps")
+        _check_numbers("lowpass.a", lowpass.a, 3, "steps")
+        if lowpass.a[0] != 1.0 or not abs(sum(lowpass.b) - sum(lowpass.a)) < 1e-4:
+            raise ValueError(
+                f"lowpass: a is {lowpass.a} and b {lowpass.b}, which would not keep a constant"
+                " target (need a[0] = 1 and equal sums)"
+            )
 
 
 def _check_term(contract: Contract, term: Term, where: str) -> None:
@@ -247,6 +332,7 @@ def _check_term(contract: Contract, term: Term, where: str) -> None:
     if size == "gait" and not contract.gait_period > 0.0:
         raise ValueError(f"{where} needs a gait_period in s above 0")
     check_range(f"{where}: history", term.history, 1, 1000)
+    check_range(f"{where}: ahead", term.ahead, 0, 1000 * term.name.startswith(OF_MOTION))
     _check_numbers(f"{where}: scale", term.scale, term.size, "numbers")
     _check_numbers(f"{where}: offset", term.offset, term.size, "numbers")
     _check_limits(f"{where}: clip", term.clip)
@@ -285,6 +371,10 @@ def frame_runs(contract: Contract) -> list[list[int]]:
     return runs
 
 
+PARTS = {"action": Action, "gains": Gains, "lowpass": Lowpass, "motion": Motion}
+"""Fields that are JSON objects themselves."""
+
+
 def from_record(record: Any, origin: str) -> Contract:
     """Return the contract of plain values as :meth:`Contract.to_record` gives them.
 
@@ -312,7 +402,12 @@ def from_record(record: Any, origin: str) -> Contract:
             records.from_dict(Term, term, f"observation[{i}]") for i, term in enumerate(terms)
         )
         values["memory"] = tuple(tuple(pair) for pair in values.get("memory", ()))
-        for key, kind in (("action", Action), ("gains", Gains)):
+        if isinstance(limits := values.get("joint_limits", ()), list):
+            values["joint_limits"] = tuple(map(tuple, limits))
+        motion = values.get("motion")
+        if isinstance(motion, dict) and isinstance(motion.get("frames"), list):
+            values["motion"] = motion | {"frames": tuple(map(tuple, motion["frames"]))}
+        for key, kind in PARTS.items():
             if values.get(key) is not None:
                 values[key] = records.from_dict(kind, values[key], key)
         return records.from_dict(Contract, values, "contract")

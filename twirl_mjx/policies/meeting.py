@@ -10,6 +10,7 @@ step of the worlds, whatever its own rate; its clocks count its own steps.
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -19,10 +20,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from twirl_mjx.checks import check_range
+from twirl_mjx.motion.clip import Clip, ClipArrays, sample
 from twirl_mjx.policies.contract import Contract, ContractError, frame_runs
 from twirl_mjx.policies.function import Brain, fresh_worlds, restart, spread
 from twirl_mjx.sim import frames
 from twirl_mjx.sim.robot import ROOT_SIZE, Robot
+from twirl_mjx.tasks.imitate import to_heading
 
 TOWARDS = "towards-goal"
 MAX_YAW_RATE = 1.0
@@ -96,6 +99,40 @@ def parse_command(text: str, contract: Contract) -> Command:
 
 
 @dataclasses.dataclass(frozen=True)
+class Reference:
+    """A contract's motion on the device."""
+
+    clip: ClipArrays
+    duration: float
+    """s, of a cycle."""
+    start: float
+    """s, time within the motion at reset."""
+
+    @classmethod
+    def of(cls, contract: Contract, order: np.ndarray, robot: Robot) -> Reference | None:
+        """Return the motion of a contract; None where it has none."""
+        if (motion := contract.motion) is None:
+            return None
+        rows = np.array(motion.frames)
+        joints = np.zeros_like(rows[:, ROOT_SIZE:])
+        joints[:, order] = rows[:, ROOT_SIZE:]
+        try:
+            clip = Clip(rows[:, :3], rows[:, 3:7], joints, motion.frame_dt, "wrap", motion.travels,
+                        motion.turns, contract.name, robot)  # fmt: skip
+        except ValueError as error:
+            raise ContractError(f"contract: motion: {error}") from error
+        return cls(clip.to_arrays(), clip.cycle_duration, motion.start)
+
+    def at(self, time: jax.Array) -> jax.Array:
+        """Return [N, 7 + J] at times [N] in s since reset."""
+        return jax.vmap(lambda t: sample(self.clip, t)[0])(self.start + time)
+
+    def cycles(self, time: jax.Array) -> jax.Array:
+        """Return how many cycles have begun [N]; the margin is that of the task."""
+        return jnp.floor((self.start + time) / self.duration + 1e-4)
+
+
+@dataclasses.dataclass(frozen=True)
 class Seen:
     """What terms are made of, N worlds."""
 
@@ -112,6 +149,24 @@ class Seen:
     previous: jax.Array
     """[N, J] last output."""
     commands: jax.Array
+    reference: Reference | None = None
+    """The contract's motion."""
+    offset: jax.Array | None = None
+    """[N, 2] m, by which the motion was moved."""
+    ahead: int = 0
+    """Control steps from now, for what is shown of the motion."""
+
+    @functools.cached_property
+    def target(self) -> jax.Array:
+        """[N, 7 + J] the motion, joints in the robot's order."""
+        assert self.reference is not None, "a contract with such words has a motion"
+        later = self.time + jnp.float32(self.ahead * self.contract.control_dt)
+        return self.reference.at(later).at[:, :2].add(self.offset)
+
+    @property
+    def heading(self) -> jax.Array:
+        """[N] rad, yaw of the base."""
+        return frames.yaw(self.qpos[:, 3:7])
 
     @property
     def pose(self) -> jax.Array:
@@ -158,6 +213,12 @@ FILL: dict[str, Callable[[Seen], jax.Array]] = {
     "goal_displacement_w": lambda s: s.goal - s.qpos[:, :2],
     "base_x_axis_w": lambda s: frames.base_axes(s.qpos[:, 3:7])[0],
     "base_z_axis_w": lambda s: frames.base_axes(s.qpos[:, 3:7])[2],
+    "base_quat_h": lambda s: to_heading(s.qpos[:, 3:7], s.heading),
+    "target_base_displacement_h": lambda s: frames.rotate(
+        frames.from_yaw(-s.heading), s.target[:, :3] - s.qpos[:, :3]
+    ),
+    "target_base_quat_h": lambda s: to_heading(s.target[:, 3:7], s.heading),
+    "target_joint_pos": lambda s: s.target[:, ROOT_SIZE:][:, s.order],
 }
 """How every word of the vocabulary but ``constant`` is filled, [N, size] each."""
 
@@ -171,6 +232,8 @@ class MeetingMemory(flax.struct.PyTreeNode):
     """[N, J] last output."""
     history: tuple[jax.Array, ...]
     """[N, H, size] of every term with a history, oldest first."""
+    offset: jax.Array
+    """[N, 2] m, by which the contract's motion was moved."""
     brain: Any
     """Memory of the policy itself."""
 
@@ -201,6 +264,7 @@ class ContractPolicy:
         self._command = command
         self._order = contract.joint_order(robot)
         self._dt = robot.control_dt
+        self._reference = Reference.of(contract, self._order, robot)
 
     def init(self, state: Any) -> MeetingMemory:
         """Return the memory of freshly reset worlds."""
@@ -210,6 +274,7 @@ class ContractPolicy:
             start=state.data.qpos[:, :3],
             previous=jnp.zeros((*worlds, self.contract.action_size)),
             history=tuple(jnp.zeros((*worlds, t.history, t.size)) for t in longer),
+            offset=jnp.zeros((*worlds, 2)),
             brain=spread(self._brain.initial_memory, state),
         )
 
@@ -233,7 +298,9 @@ class ContractPolicy:
             jnp.asarray(x, jnp.float32)
             for x in (self._robot.default_pose, self._robot.action_half_range)
         )
-        following = memory.replace(previous=output, history=history, brain=thought)
+        following = memory.replace(
+            previous=output, history=history, offset=self._offset(memory, state), brain=thought
+        )
         return (target - rest) / reach, following
 
     def observe(
@@ -252,11 +319,17 @@ class ContractPolicy:
             time=step.astype(jnp.float32) * jnp.float32(self._dt),
             previous=memory.previous,
             commands=self._command.at(qpos, state.world.goal),
+            reference=self._reference,
+            offset=self._offset(memory, state),
         )
+        times = {term.ahead for term in contract.observation}
+        at = {ahead: dataclasses.replace(seen, ahead=ahead) for ahead in times}
         now, history = [], []
         for term in contract.observation:
             zeros = jnp.zeros((len(qpos), term.size))
-            value = zeros if term.name == "constant" else FILL[term.name](seen)
+            value = zeros
+            if term.name != "constant":
+                value = FILL[term.name](at[term.ahead])
             value = jnp.asarray(term.scale, jnp.float32) * (
                 value - jnp.asarray(term.offset, jnp.float32)
             )
@@ -269,6 +342,16 @@ class ContractPolicy:
                 value = history[-1]
             now.append(value)
         return _flat(contract, now), seen, tuple(history)
+
+    def _offset(self, memory: MeetingMemory, state: Any) -> jax.Array:
+        """Return where the motion stands [N, 2]: a new cycle begins where the base is."""
+        if (reference := self._reference) is None:
+            return memory.offset
+        step, dt = state.world.episode_step, jnp.float32(self._dt)
+        time = step.astype(jnp.float32) * dt
+        begins = reference.cycles(time) > reference.cycles((step - 1).astype(jnp.float32) * dt)
+        here = state.data.qpos[:, :2] - reference.at(time)[:, :2]
+        return jnp.where(((step == 0) | begins)[:, None], here, memory.offset)
 
 
 def _flat(contract: Contract, values: list[jax.Array]) -> jax.Array:

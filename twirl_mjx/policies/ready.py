@@ -8,12 +8,23 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-from twirl_mjx.checks import choose_one
+from twirl_mjx.checks import choose_one, nearest
 from twirl_mjx.policies import contract as schema
-from twirl_mjx.policies.contract import Action, Contract, ContractError, Gains, Numbers, Term
+from twirl_mjx.policies.contract import (
+    Action,
+    Contract,
+    ContractError,
+    Gains,
+    Lowpass,
+    Motion,
+    Numbers,
+    Term,
+)
 from twirl_mjx.sim.robot import Robot
-from twirl_mjx.tasks.observations import Entry
+from twirl_mjx.tasks.imitate import ImitateObserver
+from twirl_mjx.tasks.observations import Entry, Observer
 from twirl_mjx.tasks.registry import TASKS
+from twirl_mjx.tasks.task import Task
 
 KINDS = ("hip", "thigh", "calf")
 
@@ -114,32 +125,37 @@ READY = {
 
 
 def own_contract(
-    task: str, layout: tuple[Entry, ...], robot: Robot, name: str | None = None
+    name: str, layout: tuple[Entry, ...], robot: Robot, motion: Motion | None = None
 ) -> Contract:
-    """Return the contract of a task of this project with a proprioceptive observation.
+    """Return the contract of a policy trained in a task of this project.
 
     Args:
-        task: What errors call the task.
-        layout: Its observation; history entries end in ``[-2]`` ... ``[0]``.
+        name: Name of the task.
+        layout: Its observation; history entries end in ``[-2]`` ... ``[0]``, those of the motion in
+            ``[+1]`` and so on.
         robot: Whose legs.
-        name: Name of the contract, the task's by default.
+        motion: What the task follows, if anything.
 
     Raises:
-        ContractError: An entry that only the task itself can fill, a reference motion say.
+        ContractError: An entry of the observation that is no word of the vocabulary.
     """
     terms: list[Term] = []
-    steps = {e.name.partition("[")[2] for e in layout if e.name.endswith("]")}
+    steps = {e.name.partition("[")[2] for e in layout if "[" in e.name}
+    history = sum("+" not in step for step in steps)
     for entry in layout:
         plain, _, step = entry.name.partition("[")
         if plain not in schema.VOCABULARY:
             raise ContractError(
-                f"task {task} shows {entry.name!r}, which depends on the task itself and not on the"
-                " robot alone: no contract can say it (its own policy files bring their observer)"
+                f"task {name} shows {entry.name!r}, which is no word of a contract (nearest:"
+                f" {nearest(plain, schema.VOCABULARY)!r})"
             )
-        if step in ("", "0]"):
-            terms.append(Term(plain, entry.size, history=len(steps) if step else 1))
+        if step.startswith("+"):
+            terms.append(Term(plain, entry.size, ahead=int(step.removesuffix("]"))))
+        elif step in ("", "0]"):
+            terms.append(Term(plain, entry.size, history=history if step else 1))
+    b, a = robot.lowpass
     return Contract(
-        name=name or task,
+        name=name,
         control_dt=robot.control_dt,
         observation=tuple(terms),
         joints=robot.joints,
@@ -149,7 +165,33 @@ def own_contract(
         gains=Gains(tuple(map(float, robot.kp)), tuple(map(float, robot.kd))),
         robot=robot.name,
         facts_from="twirl_mjx: tasks/observations.py, sim/robots",
-        cutoff_hz=robot.cutoff_hz,
+        lowpass=Lowpass(robot.cutoff_hz, (b[0], b[1], b[2]), (a[0], a[1], a[2])),
+        joint_limits=tuple((float(low), float(high)) for low, high in robot.joint_limits),
+        torque_limit=tuple(map(float, robot.torque_limit)),
+        motion=motion,
+    )
+
+
+def contract_of_task(task: Task) -> Contract:
+    """Return the contract of a task that is bound to its robot and options.
+
+    Raises:
+        ContractError: As :func:`own_contract`.
+    """
+    return own_contract(task.name, task.observer.layout, task.robot, motion_of(task.observer))
+
+
+def motion_of(observer: Observer) -> Motion | None:
+    """Return what a task follows; None where it follows nothing."""
+    if not isinstance(observer, ImitateObserver):
+        return None
+    clip = observer.motion
+    return Motion(
+        frame_dt=clip.frame_duration,
+        frames=tuple(tuple(round(float(x), 6) for x in frame) for frame in clip.qpos),
+        start=observer.standing_time,
+        travels=clip.cycle_offset_position,
+        turns=clip.cycle_offset_rotation,
     )
 
 
@@ -164,7 +206,7 @@ def find_contract(text: str, robot: Robot) -> Contract:
         return READY[text]
     if text in TASKS.names():
         kind = TASKS.get(text)
-        return own_contract(text, kind(kind.paper_options(), robot=robot).observer.layout, robot)
+        return contract_of_task(kind(kind.paper_options(), robot=robot))
     if Path(text).suffix == ".json" or Path(text).exists():
         return schema.read(text)
     names = [*READY, *TASKS.names()]

@@ -31,7 +31,7 @@ from twirl_mjx.policies.meeting import ContractPolicy, parse_command
 from twirl_mjx.policies.onnx_file import OnnxPolicy
 from twirl_mjx.policies.ready import find_contract
 from twirl_mjx.policies.source import ActOnObs, ObservingSource, OwnTaskSource, actor_act
-from twirl_mjx.sim.robots import ROBOTS
+from twirl_mjx.sim.robots import A1, ROBOTS
 from twirl_mjx.tasks.imitate import ImitateOptions
 from twirl_mjx.tasks.observations import layout_size
 from twirl_mjx.tasks.registry import TASKS
@@ -226,6 +226,18 @@ def header_of(name: str) -> PolicyHeader | None:
     return load_policy(path).header
 
 
+def takes_terms(name: str) -> bool:
+    """Return whether a contract or a command can mean anything to a source.
+
+    Raises:
+        FileNotFoundError: Nothing to load there.
+        PolicyFileError: The file is no policy.
+    """
+    if name in SCRIPTED_SOURCES or recorded.is_recording(Path(name)):
+        return False
+    return header_of(name) is None
+
+
 def _digest(path: Path, header: PolicyHeader | None) -> str:
     if path.is_dir() and header is not None:
         return f"{header.config_digest}@{header.card.get('env_steps')}"
@@ -251,12 +263,21 @@ def config_of_source(
 
 
 def config_of_card(header: PolicyHeader, origin: str) -> WorldConfig:
-    """Return the worlds of a policy's own task, with the task options on its card.
+    """Return the worlds of a policy's own task and robot, with the task options on its card.
 
     Raises:
-        PolicyFileError: As :func:`config_of_source`.
+        PolicyFileError: As :func:`config_of_source`, or a robot that is not there.
     """
-    return WorldConfig(task=header.task, options=options_of_card(header, origin))
+    options = options_of_card(header, origin)
+    try:
+        return WorldConfig(task=header.task, options=options, robot=robot_of_card(header))
+    except ValueError as error:
+        raise PolicyFileError(f"{origin}: {error}") from error
+
+
+def robot_of_card(header: PolicyHeader) -> str:
+    """Return the robot on a policy's card, a name or ``file.py:NAME``; cards of 0.1 have none."""
+    return str(header.card.get("robot", A1.name))
 
 
 def options_of_card(header: PolicyHeader, origin: str) -> Any:

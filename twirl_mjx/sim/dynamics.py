@@ -273,12 +273,12 @@ PAPER_SHIFTS = shift_names()
 """Nominal conditions and the five shifts of the paper, which evaluation goes through."""
 
 
-def make_dynamics(
+def leaf_values(
     shift: str = "none",
     strength: float = 1.0,
     overrides: Mapping[str, float] = MappingProxyType({}),
-) -> Dynamics:
-    """Return the parameters (scalars) of a shift at a given strength.
+) -> dict[str, float]:
+    """Return the value of every leaf under a shift at a given strength.
 
     Args:
         shift: Name of a shift.
@@ -306,6 +306,16 @@ def make_dynamics(
         values[name] = value
     for name, value in overrides.items():
         values[name] = check_leaf("dynamics.", name, value, chosen.scene)
+    return values
+
+
+def make_dynamics(
+    shift: str = "none",
+    strength: float = 1.0,
+    overrides: Mapping[str, float] = MappingProxyType({}),
+) -> Dynamics:
+    """Return :func:`leaf_values` as parameters (scalars); those of no effect are left out."""
+    values = leaf_values(shift, strength, overrides)
     always = {f.name for f in dataclasses.fields(Dynamics) if f.default is dataclasses.MISSING}  # type: ignore[arg-type]
     active = {k: v for k, v in values.items() if k in always or v != LEAF[k].nominal}
     return Dynamics(**{k: jnp.asarray(np.float32(v)) for k, v in active.items()})

@@ -185,6 +185,14 @@ def world_model(scene: Scene, dynamics: Dynamics) -> mujoco.MjModel:
     return model
 
 
+def silence() -> None:
+    """Keep MuJoCo's own warnings off the terminal and out of ``MUJOCO_LOG.TXT``.
+
+    A world that diverges is found and counted by who steps it, in words of this project.
+    """
+    mujoco.set_mju_user_warning(lambda text: None)
+
+
 class NativeEngine:
     """C MuJoCo in host threads (``mujoco.rollout``), called from inside jitted code.
 
@@ -261,6 +269,7 @@ class NativeEngine:
     def _prepare(self, layout: Layout, physics: np.ndarray) -> list[mujoco.MjModel]:
         """Return one model per world holding its parameters ``physics`` [N, P]."""
         if self._rollout is None:
+            silence()
             self._rollout = mujoco.rollout.Rollout(nthread=self._threads)
             self._data = [mujoco.MjData(self._scene.mj_model) for _ in range(self._threads)]
         if len(self._models) != len(physics) or self._layout != layout:

@@ -40,6 +40,8 @@ class Cell:
     """``--source`` of the run: where the source lies."""
     needs: tuple[str, ...] = ()
     """Names of the runs that have to be finished before."""
+    contract: str = ""
+    """``--source-contract`` of the run: a name, or where its file lies."""
 
     @property
     def is_shifted(self) -> bool:
@@ -99,7 +101,8 @@ def resolve(draft: Draft, runs: Path, given: Mapping[str, Path], cells: dict[str
         ValueError: Its run is that of another arm already; the message names both arms.
     """
     identity, place, needs = _source_of(draft, runs, given, cells)
-    config = dataclasses.replace(draft.config, source=identity)
+    contract, contract_place = _contract_of(draft.config)
+    config = dataclasses.replace(draft.config, source=identity, source_contract=contract)
     name = run_name(config)
     if not draft.arm and (adopted := _adoptable(draft, runs)):
         name = adopted
@@ -110,9 +113,16 @@ def resolve(draft: Draft, runs: Path, given: Mapping[str, Path], cells: dict[str
                 f" {name}, which one table can hold (drop one arm, or change a setting of it)"
             )
         return known
-    cell = Cell(name, draft.arm, draft.preset, config, place, needs)
+    cell = Cell(name, draft.arm, draft.preset, config, place, needs, contract_place)
     cells[name] = cell
     return cell
+
+
+def _contract_of(config: TrainConfig) -> tuple[str, str]:
+    """Return what the contract of a foreign source is, and where it lies; names are themselves."""
+    if not (path := Path(config.source_contract)).is_file():
+        return config.source_contract, config.source_contract
+    return _identity_of_path(path), str(path.resolve())
 
 
 def _source_of(
@@ -214,7 +224,11 @@ def is_finished(cell: Cell, runs: Path) -> bool:
     if steps is None:
         return False
     if cell.name == run_name(cell.config):
-        found = dataclasses.replace(RunDir(run_dir).read_config(), source=cell.config.source)
+        found = dataclasses.replace(
+            RunDir(run_dir).read_config(),
+            source=cell.config.source,
+            source_contract=cell.config.source_contract,
+        )
         if found != cell.config:
             lines = "\n  ".join(config_json.diff(found, cell.config))
             raise ValueError(f"{run_dir} was changed by hand (there -> cell):\n  {lines}")
@@ -235,7 +249,9 @@ def status_of(cell: Cell, runs: Path) -> Status:
 def arguments(cell: Cell, runs: Path) -> list[str]:
     """Return the arguments of ``twirl`` that train (or resume) a cell."""
     plain = config_json.flatten(make_config(cell.config.task, cell.preset))
-    wanted = config_json.flatten(dataclasses.replace(cell.config, source=cell.source))
+    wanted = config_json.flatten(
+        dataclasses.replace(cell.config, source=cell.source, source_contract=cell.contract)
+    )
     argv = ["train", "--preset", cell.preset, "--task", cell.config.task]
     argv += ["--name", cell.name, "--runs", str(runs)]
     for field, value in wanted.items():

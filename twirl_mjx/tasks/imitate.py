@@ -25,12 +25,12 @@ import numpy as np
 from twirl_mjx.assets import asset_path
 from twirl_mjx.checks import check_range
 from twirl_mjx.motion.clip import Clip, headings, sample
-from twirl_mjx.motion.formats import AS_IS, Conversion, foot_paths, read_clip
-from twirl_mjx.motion.plausible import check_plausible
+from twirl_mjx.motion.formats import AS_IS, Conversion, foot_paths
+from twirl_mjx.motion.retarget import read_motion
 from twirl_mjx.sim import frames, kinematics
 from twirl_mjx.sim.dynamics import Dynamics
 from twirl_mjx.sim.robot import CONTROL_DT, HIP, ROOT_SIZE, THIGH, TRUNK, Robot
-from twirl_mjx.sim.robots import A1
+from twirl_mjx.sim.robots import A1, ROBOTS
 from twirl_mjx.sim.scene import Scene
 from twirl_mjx.tasks import base, rewards
 from twirl_mjx.tasks.observations import HISTORY, Entry, in_history
@@ -76,6 +76,7 @@ def load_clip(
     robot: Robot = A1,
     legs: tuple[str, ...] = (),
     conversion: Conversion = AS_IS,
+    recorded_on: Robot | None = None,
 ) -> Clip:
     """Return the clip of a config, turned to face +x on average.
 
@@ -84,20 +85,21 @@ def load_clip(
         robot: Whose motion it is.
         legs: Order of the legs in the file, by default what it says.
         conversion: Units and frames of the file.
+        recorded_on: Robot whose motion the file holds, if that is another one: its feet are
+            followed.
 
     Raises:
         FileNotFoundError: There is no such file.
         ValueError: The file is no clip, it cannot be a motion of this robot
             (``plausible``), its motion ends, or the shipped clip is another robot's.
     """
-    if name == "leap" and robot is not A1:
+    if name == "leap" and A1 not in (robot, recorded_on):
         raise ValueError(
             f"imitate.clip 'leap' is a motion of robot {A1.name!r}, not of {robot.name!r}"
-            " (nearest: the path of a clip file of its own)"
+            f" (nearest: --imitate.clip-robot {A1.name}, which follows its feet)"
         )
-    path = asset_path(robot.name, "leap.json") if name == "leap" else name
-    clip = read_clip(path, legs, robot, conversion)
-    check_plausible(clip)
+    path = asset_path(A1.name, "leap.json") if name == "leap" else name
+    clip = read_motion(path, robot, legs, conversion, recorded_on)
     if clip.loop != "wrap":
         raise ValueError(
             f"imitate.clip {name!r} has loop mode {clip.loop!r}, which ends after one cycle;"
@@ -173,6 +175,8 @@ class ImitateObserver:
         self.layout = make_layout(clip.robot)
         self.control_dt = clip.robot.control_dt
         """s, control step."""
+        self.motion = clip
+        """The clip itself."""
         self.clip = clip.to_arrays()
         self.duration = clip.cycle_duration
         """s, length of a cycle."""
@@ -277,6 +281,9 @@ class ImitateOptions:
     """Root frame of the clip: x forward and z up, or that of a Laikago."""
     clip_fps: float = 0.0
     """Frames per second of the clip, instead of what the file says; 0 to keep that."""
+    clip_robot: str = ""
+    """Robot the clip was recorded on, by name or file.py:NAME, where it is another one: its feet
+    are followed, scaled by the length of the legs."""
     standing_fraction: float = 0.0
     """Share of episodes started at rest on four feet, as the episodes of ``hurdles`` are."""
     max_root_error: float = 1.0
@@ -300,7 +307,8 @@ class ImitateOptions:
 
     def load_clip(self, robot: Robot) -> Clip:
         """Return the clip these options name; errors of :func:`load_clip`."""
-        return load_clip(self.clip, robot, self.clip_legs, self.conversion)
+        other = ROBOTS.get(ROBOTS.admit(self.clip_robot)) if self.clip_robot else None
+        return load_clip(self.clip, robot, self.clip_legs, self.conversion, other)
 
 
 @register

@@ -1,4 +1,4 @@
-"""What stops a training run: numbers that are no longer finite."""
+"""What stops a training run: numbers that are not finite."""
 
 from __future__ import annotations
 
@@ -33,18 +33,33 @@ def check_finite(learner: Any) -> None:
             )
 
 
-def check_experience(inserted: int, env_steps: int) -> None:
+MAX_DROPPED = 0.01
+"""Largest share of the transitions of a run that may be dropped."""
+
+
+def check_experience(inserted: int, env_steps: int, budget: int, cause: str) -> None:
     """Check that the worlds give transitions to learn from.
 
     Args:
         inserted: Transitions kept so far.
         env_steps: Transitions gathered so far.
+        budget: Transitions of the whole run.
+        cause: Why the first one was dropped, if that is known.
 
     Raises:
-        DivergedError: Every transition so far had a state that is not finite and was dropped.
+        DivergedError: Every transition so far was dropped, or more of them than ``MAX_DROPPED`` of
+            the budget.
     """
+    dropped = env_steps - inserted
+    first = f"; the first one because {cause}" if cause else ""
     if env_steps and not inserted:
         raise DivergedError(
-            f"none of {env_steps:,} transitions was finite: the worlds diverge"
+            f"none of {env_steps:,} transitions was finite{first}: the worlds diverge"
             " from the start; look at the task's options and at the dynamics"
+        )
+    if dropped > MAX_DROPPED * budget:
+        raise DivergedError(
+            f"{dropped:,} of {env_steps:,} transitions were dropped, more than {MAX_DROPPED:.0%} of"
+            f" the {budget:,} of this run{first}: what is learned from the rest is not the task;"
+            " look at its reward, its clip and the dynamics"
         )

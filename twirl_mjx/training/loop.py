@@ -23,12 +23,14 @@ from twirl_mjx.training.checkpoint import stored_steps
 from twirl_mjx.training.guards import DivergedError, check_experience, check_finite
 from twirl_mjx.training.learners import check_learner
 from twirl_mjx.training.logger import RunLogger
+from twirl_mjx.training.metrics import FIRST_DROP
 from twirl_mjx.training.program import Program
 from twirl_mjx.training.run import Part, Run
 from twirl_mjx.training.rundir import RunDir
 from twirl_mjx.training.signals import stop_on_signal
 from twirl_mjx.training.sinks.table import FINAL
 from twirl_mjx.training.state import TrainState
+from twirl_mjx.worlds.vector import FAULTS
 
 
 @dataclasses.dataclass(frozen=True)
@@ -139,7 +141,7 @@ class Batch:
                 self.took_weights = True
         else:
             states = self.program.stack(self._restore(step))
-        return self.program.with_sources(states, [part.source for part in self._parts])
+        return self.program.place(states, [part.source for part in self._parts])
 
     def _restore(self, step: int) -> list[TrainState]:
         """Return the checkpoints of all seeds at ``step``, or before it where one is damaged."""
@@ -165,7 +167,7 @@ class Batch:
         Returns:
             Mean measures by name, [S]; NaN where a measure is not defined, or a seed diverged.
         """
-        actors = states.learner.actor
+        actors = jax.device_put(states.learner.actor, jax.devices()[0])
         found = self.program.evaluate(actors, jax.random.key(self.config.eval.seed))
         counts = {"env_steps": int(states.env_steps), "grad_steps": grad_steps(states)}
         means = [
@@ -195,7 +197,12 @@ class Batch:
                 continue
             try:
                 check_finite(learners[index])
-                check_experience(int(inserted[index]), int(states.env_steps))
+                check_experience(
+                    int(inserted[index]),
+                    int(states.env_steps),
+                    self.config.total_env_steps,
+                    run.progress["first_drop"],
+                )
             except DivergedError as error:
                 run.fault = error
                 if self.live:
@@ -236,6 +243,8 @@ class Batch:
             else:
                 states, metrics = self.program.epoch(states)
             values = {name: np.asarray(value) for name, value in metrics.items()} | fixed
+            if not self.note_drops(values[FIRST_DROP]):
+                del values[FIRST_DROP]
             self.guard(states, logger)
             for run in self.live:
                 run.progress["wall_s"] = before + time.monotonic() - began
@@ -251,6 +260,16 @@ class Batch:
                 saved = time.monotonic()
         self.save(states)
         return states
+
+    def note_drops(self, faults: np.ndarray) -> bool:
+        """Remember why the first transition of a run was dropped; ``faults`` is [S] or a number.
+
+        Returns:
+            Whether any was in this epoch.
+        """
+        for run, fault in zip(self.runs, np.atleast_1d(faults), strict=True):
+            run.progress["first_drop"] = run.progress["first_drop"] or FAULTS[int(fault)]
+        return bool(np.any(faults > 0))
 
     def is_late(self) -> bool:
         """Return whether the time that was given is over."""
@@ -301,6 +320,8 @@ def train(
         with stop_on_signal() as stop, RunLogger(infos, sinks, name=batch.name) as logger:
             if steps:
                 logger.announce(f"resuming {batch.name} at {steps:,} transitions")
+            if batch.program.idle_devices:
+                logger.announce(batch.program.idle_devices)
             for run in batch.runs:
                 if run.checkpoints.stepped_over:
                     logger.announce(run.checkpoints.stepped_over)

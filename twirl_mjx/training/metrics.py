@@ -7,6 +7,8 @@ from collections.abc import Mapping
 from twirl_mjx.checks import nearest
 from twirl_mjx.types import MetricInfo
 
+FIRST_DROP = "first_drop"
+
 METRICS: dict[str, MetricInfo] = {
     # Means over the episodes that ended during the epoch, exploring policy.
     "return": MetricInfo("undiscounted return of an episode", "1"),
@@ -18,6 +20,11 @@ METRICS: dict[str, MetricInfo] = {
     "reward": MetricInfo("reward of one transition", "1"),
     "dropped_transitions": MetricInfo(
         "transitions dropped because a state, observation, reward or action was not finite", "1"
+    ),
+    FIRST_DROP: MetricInfo(
+        "why the first of them was: 1 state not finite, 2 state out of bounds, 3 observation,"
+        " 4 reward, 5 action; only in epochs that dropped any",
+        "1",
     ),
     # Bookkeeping.
     "env_steps_per_s": MetricInfo(

@@ -38,7 +38,7 @@ SETTINGS: dict[str, Mapping[str, Any]] = {
         "replay.capacity": 1000,
         "replay.source_size": 64,
         "eval.every": 64,
-        "eval.episodes": 2,
+        "eval.episodes": 4,
         "eval.final_episodes": 4,
         "eval.episode_length": 20,
         "checkpoint_minutes": 0.0,

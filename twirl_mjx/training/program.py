@@ -16,6 +16,7 @@ import numpy as np
 from twirl_mjx.evaluation.rollout import ActFn, first_episodes, make_evaluate
 from twirl_mjx.replay.ring import RingBuffer
 from twirl_mjx.training import seeds as batch
+from twirl_mjx.training import sharding
 from twirl_mjx.training import state as single
 from twirl_mjx.training.config import TrainConfig
 from twirl_mjx.training.learners import learner_of
@@ -96,11 +97,28 @@ class Program:
         self.evaluate = compile_evaluation(config, num_seeds)
         self._config = config
         self._own_sources = own_sources
-        self.epoch = (
-            single.compile_epoch(config, self.env)
-            if num_seeds == 1
-            else batch.compile_epoch_seeds(config, self.env, own_sources=own_sources)
-        )
+        self.idle_devices: str | None = None
+        """Why devices that are there are not used, as a line."""
+        self.epoch, self._place = self._compile()
+
+    def _compile(self) -> tuple[sharding.Epoch, sharding.Place]:
+        """Return the epoch and what puts a state where it runs: seeds or worlds on all devices."""
+        config, env, own = self._config, self.env, self._own_sources
+        alone = self.num_seeds == 1
+        if (devices := jax.device_count()) > 1:
+            what = ("num_envs", env.num_envs) if alone else ("seeds", self.num_seeds)
+            try:
+                sharding.check_even(*what, devices)
+            except ValueError as error:
+                self.idle_devices = f"one device is used: {error}"
+            else:
+                mesh = sharding.device_mesh(sharding.WORLDS if alone else sharding.SEEDS)
+                if alone:
+                    return sharding.spread_worlds(config, env, mesh)
+                return sharding.spread_seeds(config, env, mesh, own_sources=own)
+        if alone:
+            return single.compile_epoch(config, env), lambda state: state
+        return batch.compile_epoch_seeds(config, env, own_sources=own), lambda states: states
 
     def init(self, seeds: Sequence[int]) -> TrainState:
         """Return the states of S seeds before the first transition, without source rings."""
@@ -127,9 +145,9 @@ class Program:
         """Return the state of one seed of the batch, for a checkpoint."""
         return states if self.num_seeds == 1 else batch.seed_state(states, index)
 
-    def with_sources(self, states: TrainState, sources: Sequence[RingBuffer | None]) -> TrainState:
-        """Return the states with the source ring of every seed, or the one all seeds share."""
+    def place(self, states: TrainState, sources: Sequence[RingBuffer | None]) -> TrainState:
+        """Return the states where they are trained, with their source rings or the shared one."""
         given = [source for source in sources if source is not None]
         own = self._own_sources and self.num_seeds > 1
         source = batch.stack_rings(given) if own else sources[0]
-        return states.replace(replay=states.replay.replace(source=source))
+        return self._place(states.replace(replay=states.replay.replace(source=source)))

@@ -13,6 +13,7 @@ import numpy as np
 
 from twirl_mjx.policies.learned import PolicyHeader, save_policy
 from twirl_mjx.replay.ring import RingBuffer
+from twirl_mjx.sim.robots import ROBOTS
 from twirl_mjx.tasks.measures import episode_means, measures_of
 from twirl_mjx.tasks.observations import layout_slices
 from twirl_mjx.training import config_json, rundir
@@ -79,7 +80,13 @@ class Run:
         self.resumed_at: int | None = None
         self.fault: DivergedError | None = None
         """Why this seed goes on no more, although others may."""
-        self.progress: dict[str, Any] = {"best": -math.inf, "wall_s": 0.0, "inserted": 0}
+        self.progress: dict[str, Any] = {
+            "best": -math.inf,
+            "wall_s": 0.0,
+            "inserted": 0,
+            "first_drop": "",
+        }
+        """What a checkpoint holds beside the state; ``first_drop``: why, empty if none was."""
         self._env = env
         self._stage = stage
 
@@ -135,6 +142,7 @@ class Run:
             "replay_ratio": self.replay_ratio,
             "wall_s": round(self.progress["wall_s"], 1),
             "options": dataclasses.asdict(self.config.options),
+            "robot": ROBOTS.reference(self.config.robot) or self.config.robot,
             "evaluation": means,
         }
         header = make_header(self.config, self._env, card)

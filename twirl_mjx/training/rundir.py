@@ -179,6 +179,11 @@ class RunDir:
         if not self._is_held and self.owner():
             return Busy(self.busy())
         work = self._work()
+        if not work and self.config.exists() and not self._is_ours():
+            return Foreign(RunMismatchError(
+                f"{self.config} is there and is not the config of a run; nothing was touched"
+                " (nearest: another --name)"
+            ))  # fmt: skip
         if not work:
             return New()
         if not self.config.exists():
@@ -206,10 +211,24 @@ class RunDir:
             ))  # fmt: skip
         return Resumable()
 
+    def _is_ours(self) -> bool:
+        """Return whether ``config.json`` has the settings of a run, of any version."""
+        try:
+            found = files.read_json(self.config, "the config of a run")
+        except files.FileError:
+            return False
+        return isinstance(found, dict) and {"task", "variant", "seed"} <= found.keys()
+
     def _work(self) -> list[Path]:
-        """Return what there is of a run that cost something; a start that failed leaves nothing."""
+        """Return what there is of a run that cost something.
+
+        A start that failed leaves a config and what goes with it, which a new start replaces;
+        without that config they are somebody's.
+        """
         results = (self.dataset, self.policy, self.last_policy, self.episodes)
         work = [path for path in results if path.exists()]
+        if not work and not self.config.exists():
+            work = [path for path in (self.source, self.versions, self.sums) if path.exists()]
         if has_checkpoint(self.path):
             work.append(self.checkpoints)
         if self.metrics.exists() and not _is_header_only(self.metrics):

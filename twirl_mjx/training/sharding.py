@@ -22,6 +22,7 @@ from twirl_mjx.types import Metrics
 from twirl_mjx.worlds.vector import EnvState, VectorEnv
 
 Epoch = Callable[[TrainState], tuple[TrainState, Metrics]]
+Place = Callable[[TrainState], TrainState]
 
 SEEDS = "seeds"
 WORLDS = "worlds"
@@ -32,58 +33,58 @@ def device_mesh(axis: str) -> Mesh:
     return Mesh(np.asarray(jax.devices()), (axis,))
 
 
-def shard_seeds(states: TrainState, mesh: Mesh) -> TrainState:
-    """Spread a batch of seeds evenly over the devices of a mesh with the axis ``SEEDS``.
-
-    Raises:
-        ValueError: The number of seeds is not a multiple of the number of devices.
-    """
-    _check_even("seeds", seeds.num_seeds(states), mesh)
-    return jax.device_put(states, _named(seeds.per_field(PartitionSpec(SEEDS), _EVERYWHERE), mesh))
-
-
-def compile_epoch_seeds(config: TrainConfig, env: VectorEnv, mesh: Mesh) -> Epoch:
-    """Return the jitted epoch of a batch of seeds spread by ``shard_seeds``; it donates.
+def spread_seeds(
+    config: TrainConfig, env: VectorEnv, mesh: Mesh, *, own_sources: bool = False
+) -> tuple[Epoch, Place]:
+    """Return the epoch of a batch of seeds on the devices of a mesh, and what puts it there.
 
     Args:
         config: The run.
         env: The worlds of one seed.
-        mesh: Devices.
+        mesh: Devices, with the axis ``SEEDS``.
+        own_sources: Whether every seed has a source ring of its own.
+
+    Returns:
+        The jitted epoch, which donates its argument, and a function that spreads a state evenly;
+        it raises ValueError where the number of seeds is no multiple of the number of devices.
     """
-    specs = seeds.per_field(PartitionSpec(SEEDS), _EVERYWHERE)
+    specs = seeds.per_field(PartitionSpec(SEEDS), _EVERYWHERE, own_sources=own_sources)
     epoch = jax.shard_map(
-        seeds.batch_epoch(config, env),
+        seeds.batch_epoch(config, env, own_sources=own_sources),
         mesh=mesh,
         in_specs=(specs,),
         out_specs=(specs, PartitionSpec(SEEDS)),
         check_vma=False,  # that env_steps stays equal on all devices is ours to know
     )
-    return _jit_on_mesh(epoch, _named(specs, mesh), NamedSharding(mesh, PartitionSpec(SEEDS)))
+
+    def place(states: TrainState) -> TrainState:
+        check_even("seeds", seeds.num_seeds(states), mesh.size)
+        return jax.device_put(states, _named(specs, mesh))
+
+    return _jit_on_mesh(epoch, specs, PartitionSpec(SEEDS), mesh), place
 
 
-def shard_worlds(state: TrainState, mesh: Mesh) -> TrainState:
-    """Spread the worlds of one run evenly over the devices of a mesh with the axis ``WORLDS``.
-
-    Raises:
-        ValueError: The number of worlds is not a multiple of the number of devices.
-    """
-    _check_even("num_envs", state.env.reward.shape[0], mesh)
-    return jax.device_put(state, _named(_world_specs(), mesh))
-
-
-def compile_epoch_worlds(config: TrainConfig, env: VectorEnv, mesh: Mesh) -> Epoch:
-    """Return the jitted epoch of a run whose worlds were spread by ``shard_worlds``; it donates.
+def spread_worlds(config: TrainConfig, env: VectorEnv, mesh: Mesh) -> tuple[Epoch, Place]:
+    """Return the epoch of one run with its worlds on the devices of a mesh, and what puts it there.
 
     Args:
         config: The run.
         env: All its worlds.
-        mesh: Devices.
+        mesh: Devices, with the axis ``WORLDS``.
+
+    Returns:
+        The jitted epoch, which donates its argument, and a function that spreads a state evenly.
 
     Raises:
         ValueError: The number of worlds is not a multiple of the number of devices.
     """
+    specs = _world_specs()
     epoch = functools.partial(train_epoch, config, ShardedEnv(env, mesh))
-    return _jit_on_mesh(epoch, _named(_world_specs(), mesh), NamedSharding(mesh, _EVERYWHERE))
+
+    def place(state: TrainState) -> TrainState:
+        return jax.device_put(state, _named(specs, mesh))
+
+    return _jit_on_mesh(epoch, specs, _EVERYWHERE, mesh), place
 
 
 class ShardedEnv(VectorEnv):
@@ -99,7 +100,7 @@ class ShardedEnv(VectorEnv):
         Raises:
             ValueError: The number of worlds is not a multiple of the number of devices.
         """
-        _check_even("num_envs", env.num_envs, mesh)
+        check_even("num_envs", env.num_envs, mesh.size)
         part = env.num_envs // mesh.size
 
         def make(num_envs: int) -> dict[str, Any]:
@@ -115,16 +116,16 @@ class ShardedEnv(VectorEnv):
         super().__init__(env.task, env.scene, env.engine, **make(env.num_envs))
         local = VectorEnv(env.task, env.scene, env.engine, **make(part))
         self._step = jax.shard_map(
-            local.step,
+            local.step_and_fault,
             mesh=mesh,
             in_specs=(PartitionSpec(WORLDS), PartitionSpec(WORLDS)),
-            out_specs=PartitionSpec(WORLDS),
+            out_specs=(PartitionSpec(WORLDS), PartitionSpec(WORLDS)),
             check_vma=False,  # the solver's loops carry plain constants
         )
 
     def step(self, state: EnvState, action: jax.Array) -> EnvState:
         """Advance every world by one control step; see :class:`VectorEnv`."""
-        return self._step(state, action)
+        return self._step(state, action)[0]
 
 
 _EVERYWHERE = PartitionSpec()
@@ -153,14 +154,21 @@ def _named(specs: Any, mesh: Mesh) -> Any:
     )
 
 
-def _jit_on_mesh(epoch: Epoch, state: Any, metrics: NamedSharding) -> Epoch:
+def _jit_on_mesh(epoch: Epoch, specs: TrainState, metrics: PartitionSpec, mesh: Mesh) -> Epoch:
     """Compile an epoch; without a fixed place for its results a second call compiles anew."""
-    return jax.jit(epoch, in_shardings=(state,), out_shardings=(state, metrics), donate_argnums=0)
+    state = _named(specs, mesh)
+    places = (state, NamedSharding(mesh, metrics))
+    return jax.jit(epoch, in_shardings=(state,), out_shardings=places, donate_argnums=0)
 
 
-def _check_even(what: str, number: int, mesh: Mesh) -> None:
-    if number % mesh.size:
-        nearest = max(1, round(number / mesh.size)) * mesh.size
+def check_even(what: str, number: int, devices: int) -> None:
+    """Refuse a number of seeds or worlds that does not divide evenly.
+
+    Raises:
+        ValueError: It is not a multiple of the number of devices; the nearest one is named.
+    """
+    if number % devices:
+        nearest = max(1, round(number / devices)) * devices
         raise ValueError(
-            f"{what} is {number}, not a multiple of the {mesh.size} devices (nearest: {nearest})"
+            f"{what} is {number}, not a multiple of the {devices} devices (nearest: {nearest})"
         )

@@ -11,8 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from twirl_mjx.tasks import measures
+from twirl_mjx.training.guards import MAX_DROPPED, DivergedError
 from twirl_mjx.types import SourcePolicy, Transition
-from twirl_mjx.worlds.vector import VectorEnv, make_transition
+from twirl_mjx.worlds.vector import FAULTS, VectorEnv, make_transition
 
 ROUNDING = 1e-3
 """By which an action may leave [-1, 1] and not count as clipped."""
@@ -31,7 +32,7 @@ def collect(
 ) -> tuple[Transition, dict[str, float]]:
     """Return exactly ``size`` transitions of ``policy`` acting in ``env``.
 
-    Non-finite steps are dropped and replaced by further ones.
+    Steps that are not finite are dropped and replaced by further ones.
 
     Args:
         env: Worlds of the target task.
@@ -47,7 +48,7 @@ def collect(
         action box, if any did.
 
     Raises:
-        RuntimeError: More than half of the steps were not finite.
+        DivergedError: More steps than ``MAX_DROPPED`` of ``size`` were dropped.
         ValueError: A larger share than ``max_clipped`` was clipped.
     """
     reset_key, key = jax.random.split(key)
@@ -57,22 +58,22 @@ def collect(
     run = jax.jit(functools.partial(_collect_chunk, env, policy, chunk))
     rows: list[Transition] = []
     kept = dropped = 0
-    outside, told = 0.0, time.monotonic()
+    cause, outside, tell = "", 0.0, _progress(size, say)
     sums: dict[str, float] = {}
     while kept < size:
-        if time.monotonic() - told > PROGRESS_S:
-            told = time.monotonic()
-            say(f"collected {kept:,} of {size:,} transitions")
+        tell(kept)
         key, chunk_key = jax.random.split(key)
-        carry, (transitions, valid, ended, values, beyond) = run(carry, chunk_key)
-        outside += float(np.asarray(beyond)[np.asarray(valid)].sum())
-        valid, ended = np.asarray(valid), np.asarray(ended)
+        carry, (transitions, fault, ended, values, beyond) = run(carry, chunk_key)
+        fault = np.asarray(fault)
+        valid = fault == 0
+        cause = cause or next((FAULTS[i] for i in fault.ravel() if i), "")
+        outside += float(np.asarray(beyond)[valid].sum())
+        ended = np.asarray(ended)
         rows.append(jax.tree.map(lambda x, keep=valid: np.asarray(x)[keep], transitions))
         kept, dropped = kept + int(valid.sum()), dropped + int((~valid).sum())
         for name, value in (values | {"episodes": jnp.ones_like(values["return"])}).items():
             sums[name] = sums.get(name, 0.0) + float(np.asarray(value)[ended].sum())
-        if dropped > max(kept, size):
-            raise RuntimeError(f"the source policy diverges: {dropped} of {kept + dropped} steps")
+        check_dropped(dropped, kept, size, cause)
         check_clipped(outside / max(kept, 1), max_clipped)
     episodes = sums.pop("episodes")
     means = {name: value / episodes for name, value in sums.items()} if episodes else {}
@@ -80,6 +81,32 @@ def collect(
         means["clipped"] = outside / kept
     data = jax.tree.map(lambda *parts: np.concatenate(parts)[:size], *rows)
     return data, means
+
+
+def check_dropped(dropped: int, kept: int, size: int, cause: str) -> None:
+    """Refuse a recording of which too much was dropped.
+
+    Raises:
+        DivergedError: More than ``MAX_DROPPED`` of the ``size`` steps that are wanted.
+    """
+    if dropped > MAX_DROPPED * size:
+        raise DivergedError(
+            f"{dropped:,} of {kept + dropped:,} steps of the source were dropped, more than"
+            f" {MAX_DROPPED:.0%} of the {size:,} that are wanted; the first one because {cause}"
+        )
+
+
+def _progress(size: int, say: Callable[[str], None]) -> Callable[[int], None]:
+    """Return what is called with the number of transitions so far and now and then says it."""
+    told = time.monotonic()
+
+    def tell(kept: int) -> None:
+        nonlocal told
+        if time.monotonic() - told > PROGRESS_S:
+            told = time.monotonic()
+            say(f"collected {kept:,} of {size:,} transitions")
+
+    return tell
 
 
 def check_clipped(share: float, limit: float) -> None:
@@ -102,13 +129,13 @@ def _collect_chunk(
     def step(carry: tuple, step_key: jax.Array) -> tuple[tuple, tuple]:
         state, memory, tracker = carry
         action, memory = policy.act(memory, state, step_key)
-        result = env.step(state, action)
+        result, fault = env.step_and_fault(state, action)
         tracker = measures.tracker_step(env.task, tracker, result)
         values = measures.tracker_read(env.task, tracker)
         ended = result.done & ~result.invalid
         tracker = measures.tracker_reset(env.task, tracker, result.done)
         beyond = jnp.mean(jnp.abs(action) > 1.0 + ROUNDING, axis=-1)
-        out = (make_transition(state, action, result), ~result.invalid, ended, values, beyond)
+        out = (make_transition(state, action, result), fault, ended, values, beyond)
         return (result, memory, tracker), out
 
     return jax.lax.scan(step, carry, jax.random.split(key, length))

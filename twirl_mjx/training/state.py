@@ -16,6 +16,7 @@ from twirl_mjx.tasks import measures
 from twirl_mjx.tasks.measures import Tracker
 from twirl_mjx.training.config import TrainConfig
 from twirl_mjx.training.learners import learner_of
+from twirl_mjx.training.metrics import FIRST_DROP
 from twirl_mjx.types import Metrics
 from twirl_mjx.worlds.vector import EnvState, VectorEnv, make_transition
 
@@ -79,18 +80,22 @@ def init(
 
 def collect_step(
     config: TrainConfig, env: VectorEnv, state: TrainState, key: jax.Array
-) -> tuple[TrainState, EnvState]:
+) -> tuple[TrainState, EnvState, jax.Array]:
     """Act once in every world and insert the transitions.
 
     Actions are uniformly random in the first ``warmup_env_steps`` transitions, unless the actor
     begins with the weights of a source.
+
+    Returns:
+        The new state, what the worlds returned, and why transitions were dropped: [N] int32
+        indices into ``FAULTS``.
     """
     warm_key, act_key = jax.random.split(key)
     action = learner_of(config.droq).sample(state.learner.actor, state.env.obs, act_key)
     if not config.uses_source_weights:
         warm = jax.random.uniform(warm_key, action.shape, minval=-1.0, maxval=1.0)
         action = jnp.where(state.env_steps < config.warmup_env_steps, warm, action)
-    result = env.step(state.env, action)
+    result, fault = env.step_and_fault(state.env, action)
     valid = ~result.invalid
     transition = make_transition(state.env, jnp.nan_to_num(action), result)
     online = ring.insert(state.replay.online, transition, valid)
@@ -100,7 +105,7 @@ def collect_step(
         env_steps=state.env_steps + env.num_envs,
         inserted=state.inserted + jnp.sum(valid, dtype=jnp.int32),
     )
-    return state, result
+    return state, result, fault
 
 
 def update_blocks(config: TrainConfig, state: TrainState, key: jax.Array) -> tuple[Any, Metrics]:
@@ -145,7 +150,7 @@ def train_step(
         over the episodes that ended.
     """
     key, act_key, update_key = jax.random.split(state.key, 3)
-    state, result = collect_step(config, env, state.replace(key=key), act_key)
+    state, result, fault = collect_step(config, env, state.replace(key=key), act_key)
     tracker = measures.tracker_step(env.task, state.tracker, result)
     done = result.done & ~result.invalid
     finished = EpisodeSums(
@@ -161,6 +166,7 @@ def train_step(
     worlds |= {
         "reward": jnp.mean(result.reward),
         "dropped_transitions": jnp.sum(result.invalid, dtype=jnp.float32),
+        FIRST_DROP: jnp.max(fault).astype(jnp.float32),
     }
     return state.replace(learner=learner), (learner_metrics, worlds, finished)
 
@@ -179,6 +185,7 @@ def train_epoch(
     metrics = {name: jnp.nanmean(value) for name, value in learning.items()}
     metrics |= {name: jnp.mean(value) for name, value in worlds.items()}
     metrics["dropped_transitions"] = jnp.sum(worlds["dropped_transitions"])
+    metrics[FIRST_DROP] = worlds[FIRST_DROP][jnp.argmax(worlds[FIRST_DROP] > 0.0)]
     episodes = jnp.sum(finished.count)
     metrics |= {name: jnp.sum(value) / episodes for name, value in finished.values.items()}
     metrics |= {

@@ -25,7 +25,7 @@ def _page(title: str, replay: str) -> str:
     """Fill the page's template; scripts may hold anything but the end of a script."""
     text = files.read_text(asset_path("view", "page.html"), "the page")
     parts = {name: _asset(f"{name}.js") for name in ("scene", "page")}
-    text = text.replace("@TITLE@", html.escape(title))
+    text = text.replace("@TITLE@", html.escape(title)).replace("@MARK@", files.MARK)
     for name, content in (parts | {"replay": replay}).items():
         text = text.replace(f"@{name.upper()}@", content)
     return text
@@ -35,11 +35,12 @@ def _asset(name: str) -> str:
     return files.read_text(asset_path("view", name), "a script of the page")
 
 
-def check_page(path: str | Path) -> Path:
+def check_page(path: str | Path, *, overwrite: bool = False) -> Path:
     """Return the path of a page that can be written.
 
     Raises:
-        ValueError: It does not end in ``.html``, or something that is no file is there.
+        ValueError: It does not end in ``.html``, or something that this project did not write is
+            there.
     """
     path = Path(path)
     if path.suffix != ".html":
@@ -47,7 +48,7 @@ def check_page(path: str | Path) -> Path:
             f"{path}: a replay ends in .html, got {path.suffix!r} (nearest:"
             f" {path.with_suffix('.html').name})"
         )
-    files.check_target(path)
+    files.check_ours(path, overwrite=overwrite)
     return path
 
 
@@ -59,6 +60,7 @@ def write_replay(
     title: str,
     note: str = "",
     frame_dt: float = 0.05,
+    overwrite: bool = False,
     goals: np.ndarray | None = None,
     values: Mapping[str, Sequence[float]] | None = None,
 ) -> Path:
@@ -71,6 +73,7 @@ def write_replay(
         title: heading of the page.
         note: a line or more below it.
         frame_dt: time between rows, s.
+        overwrite: whether a file may be replaced that this project did not write.
         goals: [T, 2] or [T, 3] m, goal position per frame, world frame; None for none.
         values: name to [T] numbers that are shown beside the picture; None for none.
 
@@ -80,7 +83,7 @@ def write_replay(
     Raises:
         ValueError: wrong suffix, lengths or widths that do not fit, or a state that is not finite.
     """
-    path, qpos = check_page(path), np.asarray(qpos, float)
+    path, qpos = check_page(path, overwrite=overwrite), np.asarray(qpos, float)
     if qpos.ndim != 2 or qpos.shape[1] != model.nq or not len(qpos):
         raise ValueError(f"qpos has shape {qpos.shape}, expected [T >= 1, {model.nq}]")
     if not np.isfinite(qpos).all():

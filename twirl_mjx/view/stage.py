@@ -19,12 +19,17 @@ import numpy as np
 from twirl_mjx.checks import check_choice, check_range
 from twirl_mjx.deploy.conditions import CONTROL_HZ, LIVE, RANGES, SHIFTS, RehearsalConfig
 from twirl_mjx.deploy.ground import ground_height
+from twirl_mjx.deploy.pilots import find_pilot
 from twirl_mjx.deploy.reference import TASKS
 from twirl_mjx.deploy.trial import BANDS, Trial
-from twirl_mjx.policies.learned import load_policy, resolve_policy_path
+from twirl_mjx.policies.learned import resolve_policy_path
+from twirl_mjx.policies.resolve import PLAIN, header_of
+from twirl_mjx.sim.engine import silence
 from twirl_mjx.view.picture import Picture
 
 DT = 1.0 / CONTROL_HZ
+GOAL_TASKS = ("biped", "hurdles")
+"""Tasks that show a goal."""
 PUSH_S = 0.2
 """s, how long a push lasts."""
 MAX_FORCE = 500.0
@@ -69,7 +74,7 @@ class Actor(NamedTuple):
     """Somebody who can be on the stage."""
 
     policy: Any
-    """A policy file or run directory, looked at again and again, or an object with ``act``."""
+    """A path, looked at again and again, the name of any source, or an object with ``act``."""
     task: str | None = None
     """Task to act in; the one the policy was trained for by default."""
 
@@ -100,6 +105,7 @@ class Stage:
             ValueError: The first policy has no task that can be rehearsed, or sees another
                 observation than its task shows.
         """
+        silence()
         self._lock = threading.RLock()
         self._actors, self._note = dict(actors), note
         self._base = dataclasses.replace(config or RehearsalConfig(), episode_s=1e9)
@@ -146,27 +152,22 @@ class Stage:
         check_choice("policy", str(name), tuple(self._actors))
         actor = self._actors[name]
         stamp = _stamp_of(actor.policy)
-        policy = load_policy(actor.policy) if isinstance(actor.policy, Path) else actor.policy
-        task = actor.task or getattr(getattr(policy, "header", None), "task", None)
-        if task not in TASKS:
-            raise ValueError(
-                f"{name}: cannot rehearse task {task!r}; choose one of {', '.join(TASKS)}"
-                + ("" if task else ": give --task")
-            )
+        pilot, task = find_pilot(actor.policy, actor.task, None, PLAIN, self._note)
+        age = _age(actor.policy)
         with self._lock:
             shift = self._shift if self._shift in shifts_of(task) else "none"
             config = dataclasses.replace(self._base, **SHIFTS[shift])  # pyright: ignore
-            trial = Trial(policy, task, config, np.random.default_rng(self._seed))
-            policy.act(trial.observe())  # refuses an observation that it does not know
+            trial = Trial(pilot, task, config, np.random.default_rng(self._seed))
+            trial.decide()  # refuses an observation that it does not know
             self._shift, self._config = shift, config
-            self._name, self._policy, self._stamp = name, policy, stamp
+            self._name, self._pilot, self._age, self._stamp = name, pilot, age, stamp
             self._looked = time.monotonic()
             self._begin(task)
 
     def _begin(self, task: str | None = None) -> None:
         """Begin the next episode, under the conditions that hold."""
         task = task or self._trial.task
-        self._trial = Trial(self._policy, task, self._config, np.random.default_rng(self._seed))
+        self._trial = Trial(self._pilot, task, self._config, np.random.default_rng(self._seed))
         self._seed += 1
         if self._goal is not None:
             self._trial.aim(self._goal)
@@ -189,8 +190,8 @@ class Stage:
         self._begin()
 
     def _aim(self, goal: Any) -> None:
-        if self._trial.task == "hurdles":
-            raise ValueError("hurdles are the goal of task hurdles (nearest: hurdle_gap)")
+        if self._trial.task not in ("stand", "biped"):
+            raise ValueError(f"the goal of task {self._trial.task} stays where it is")
         self._goal = np.array(_numbers("goal", goal, 2, MAX_GOAL))
         self._trial.aim(self._goal)
 
@@ -261,7 +262,7 @@ class Stage:
             self._note(self._unread)
         else:
             self._unread = ""
-            self._note(f"{self._name} has changed{_age(self._policy)}")
+            self._note(f"{self._name} has changed{self._age}")
 
     def frame(self) -> dict[str, Any]:
         """Return the state as JSON-ready data.
@@ -283,7 +284,7 @@ class Stage:
                 "speed": self._speed,
                 "paused": self._pause,
                 "poses": self._picture.poses(qpos).round(4).tolist(),
-                "goal": [*place.tolist(), height] if self._trial.task != "stand" else None,
+                "goal": [*place.tolist(), height] if self._trial.task in GOAL_TASKS else None,
                 "goalMoves": self._trial.task == "biped",
                 "force": self._force.tolist(),
                 "values": readouts(trial),
@@ -295,8 +296,8 @@ class Stage:
 
     def _status(self) -> str:
         cause = self._trial.cause
-        ends = {"fall": "it fell", "hurdle": "it touched a hurdle"}
-        what = f"{self._trial.task}, {self._name}{_age(self._policy)}"
+        ends = {"fall": "it fell", "hurdle": "it touched a hurdle", "lost": "it lost the clip"}
+        what = f"{self._trial.task}, {self._name}{self._age}"
         state = f"{ends[cause]}; the next episode begins" if cause else ""
         return "\n".join(filter(None, [what, state, self._message, self._unread]))
 
@@ -323,13 +324,15 @@ def readouts(trial: Trial) -> dict[str, float]:
 
 def _age(policy: Any) -> str:
     """Return how long a policy was trained, as the end of its name."""
-    steps = getattr(getattr(policy, "header", None), "card", {}).get("env_steps")
+    header = header_of(str(policy)) if isinstance(policy, str | Path) else None
+    steps = header.card.get("env_steps") if header else None
     return f" ({steps:,} transitions)" if isinstance(steps, int) else ""
 
 
 def shifts_of(task: str) -> tuple[str, ...]:
     """Names of the shifts that a task can be rehearsed under."""
-    return tuple(name for name in SHIFTS if (name, task) != ("bumpy", "hurdles"))
+    other = {"hurdles": ("bumpy",), "imitate": ("bumpy", "sloped")}.get(task, ())
+    return tuple(name for name in SHIFTS if name not in other)
 
 
 def _stamp_of(policy: Any) -> Any:

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from twirl_mjx.checks import check_choice, check_range
-from twirl_mjx.sim.dynamics import LEAVES, SHIFTS, Dynamics, make_dynamics
+from twirl_mjx.sim.dynamics import LEAVES, SHIFTS, Dynamics, leaf_values, make_dynamics
 from twirl_mjx.sim.ranges import Ranges, parse_ranges
 from twirl_mjx.sim.robots import DEFAULT_ROBOT, ROBOTS
 from twirl_mjx.tasks.registry import TASKS
@@ -84,7 +84,7 @@ class WorldConfig:
         self._set("robot", ROBOTS.admit(self.robot))
         self._set("shift", SHIFTS.admit(self.shift))
         self._set("uses", self._references())
-        self.make_dynamics()
+        leaf_values(self.shift, self.shift_strength, self._given)
         self.ranges.check_scene(SHIFTS.get(self.shift).scene)
         self._set("randomize", self.ranges.texts())
         if self.options is None:
@@ -117,6 +117,10 @@ class WorldConfig:
         """What is drawn for every world and episode."""
         return parse_ranges(self.randomize)
 
+    @property
+    def _given(self) -> dict[str, float]:
+        return {name: value for name, value in vars(self.dynamics).items() if value is not None}
+
     def make_dynamics(self, shift: str | None = None, strength: float | None = None) -> Dynamics:
         """Return the physical parameters (scalars), those set by hand last.
 
@@ -127,11 +131,10 @@ class WorldConfig:
         Raises:
             ValueError: An unknown name, or a value that is out of range or without effect.
         """
-        given = {name: value for name, value in vars(self.dynamics).items() if value is not None}
         return make_dynamics(
             self.shift if shift is None else shift,
             self.shift_strength if strength is None else strength,
-            given,
+            self._given,
         )
 
     @property

@@ -33,6 +33,16 @@ if TYPE_CHECKING:
 MAX_STATE = 1e4
 """A world whose position or velocity exceeds this (SI units) counts as diverged."""
 
+FAULTS = (
+    "",
+    "the physical state was not finite",
+    f"the physical state was beyond {MAX_STATE:g} (SI units)",
+    "the observation was not finite",
+    "the reward was not finite",
+    "the action was not finite",
+)
+"""Why a step was invalid; index 0: it was not."""
+
 DRAW, NOISE, PUSH = 1001, 1002, 1003
 """What is folded into a world's key for draws that only some worlds make: the others' numbers do
 not depend on them. Beyond the numbers of the keys that a split gives."""
@@ -267,20 +277,29 @@ class VectorEnv:
         if jnp.shape(action) != need:
             raise ValueError(f"action has shape {jnp.shape(action)}, need {need}")
         run = self._step if _is_traced(state, action) else self._compiled_step
-        return run(state, action)
+        return run(state, action)[0]
+
+    def step_and_fault(self, state: EnvState, action: jax.Array) -> tuple[EnvState, jax.Array]:
+        """Return what :meth:`step` does, and why steps were invalid; for traced callers.
+
+        Returns:
+            The state, and [N] int32 indices into ``FAULTS``.
+        """
+        return self._step(state, action)
 
     @functools.cached_property
-    def _compiled_step(self) -> Callable[[EnvState, jax.Array], EnvState]:
+    def _compiled_step(self) -> Callable[[EnvState, jax.Array], tuple[EnvState, jax.Array]]:
         return jax.jit(self._step)
 
-    def _step(self, state: EnvState, action: jax.Array) -> EnvState:
+    def _step(self, state: EnvState, action: jax.Array) -> tuple[EnvState, jax.Array]:
         finite_action = jnp.all(jnp.isfinite(action), axis=-1)
         action = jnp.clip(jnp.nan_to_num(action.astype(jnp.float32)), -1.0, 1.0)
         world, command = jax.vmap(self._command)(state.world, state.data.ctrl, action)
         pushed = state.data.replace(qvel=jax.vmap(self._push)(world, state.data.qvel))
         data, trace = self.engine.step(pushed, command, world.dynamics)
-        world, next_obs, outcome, finite = jax.vmap(self._judge_world)(world, command, trace)
-        invalid = ~(finite & finite_action)
+        world, next_obs, outcome, fault = jax.vmap(self._judge_world)(world, command, trace)
+        fault = jnp.where(finite_action, fault, len(FAULTS) - 1)
+        invalid = fault > 0
         ended = EnvState(
             data=data,
             obs=next_obs,
@@ -299,7 +318,7 @@ class VectorEnv:
         restart = functools.partial(self._restart, ended.done)
         # Only what a restart changes goes through: a conditional copies whatever it hands on.
         physics, world, obs = jax.lax.cond(jnp.any(ended.done), restart, lambda x: x, live)
-        return ended.replace(data=data.replace(**physics), world=world, obs=obs)
+        return ended.replace(data=data.replace(**physics), world=world, obs=obs), fault
 
     def _start_world(
         self, key: jax.Array, dynamics: Dynamics
@@ -370,12 +389,15 @@ class VectorEnv:
         world = world.replace(goal=outcome.goal, task=outcome.task)
         obs = self.task.observer.observe(memory, world.goal, view.qpos, view.qvel)
         state = jnp.concatenate([view.qpos, view.qvel])
-        finite = (
-            jnp.all(jnp.abs(state) < MAX_STATE)  # false for NaN too
-            & jnp.all(jnp.isfinite(obs))
-            & jnp.isfinite(outcome.reward)
+        good = (  # in the order of FAULTS
+            jnp.all(jnp.isfinite(state)),
+            jnp.all(jnp.abs(state) < MAX_STATE),
+            jnp.all(jnp.isfinite(obs)),
+            jnp.isfinite(outcome.reward),
         )
-        return world, self._sense(world, obs), outcome, finite
+        first = jnp.argmin(jnp.stack(good)).astype(jnp.int32) + 1
+        fault = jnp.where(functools.reduce(jnp.logical_and, good), 0, first)
+        return world, self._sense(world, obs), outcome, fault
 
     def _restart(self, done: jax.Array, live: Live) -> Live:
         """Start new episodes in the worlds whose episode ended; leave the others untouched."""

@@ -1,0 +1,98 @@
+"""``twirl rehearse``: any source, a table, CSV, JSON, a film, and refusals before anything runs."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from twirl_mjx import files
+from twirl_mjx.assets import asset_path
+from twirl_mjx.commands import rehearse as command
+from twirl_mjx.deploy.conditions import RehearsalConfig
+from twirl_mjx.deploy.rehearsal import rehearse
+from twirl_mjx.policies.scripted import TROT, ClockedGait
+
+SHORT = ["--robot.episode-s", "0.4", "--robot.sim-dt", "0.005"]
+QUICK = RehearsalConfig(episode_s=0.4, sim_dt=0.005)
+
+
+def run(*words: str) -> int:
+    return command.main([*words, *SHORT], lambda draws: None)
+
+
+def test_table_csv_and_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    policy = str(asset_path("policies", "biped.npz"))
+    for name in ("r.csv", "r.json"):
+        assert run(policy, "--episodes", "3", "--out", str(tmp_path / name)) == 0
+    printed = capsys.readouterr().out
+    assert "3 episodes" in printed
+    assert "95 % from" in printed
+    with (tmp_path / "r.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert {row["episode"] for row in rows} == {"0", "1", "2"}
+    power = [float(row["value"]) for row in rows if row["metric"] == "mean_power"]
+    assert {row["unit"] for row in rows if row["metric"] == "mean_power"} == {"W"}
+    record = json.loads((tmp_path / "r.json").read_text())
+    line = next(row for row in record["table"] if row["metric"] == "mean_power")
+    assert line["mean"] == pytest.approx(np.mean(power), rel=1e-6)
+    assert min(power) - 1e-3 <= line["low"] < line["mean"] < line["high"] <= max(power) + 1e-3
+    assert len(record["episodes"]) == 3
+    assert record["robot"]["latency_ms"] == 15.0
+
+
+def test_a_scripted_source_does_what_its_numpy_form_does() -> None:
+    named = rehearse("trot", task="hurdles", episodes=1, config=QUICK).episodes[0]
+    numpy = rehearse(ClockedGait(TROT), task="hurdles", episodes=1, config=QUICK).episodes[0]
+    np.testing.assert_allclose(named.actions, numpy.actions, atol=1e-6)
+    np.testing.assert_allclose(named.qpos, numpy.qpos, atol=1e-4)
+    noise = rehearse("random", task="hurdles", episodes=1, config=QUICK).episodes[0].actions
+    assert np.ptp(noise, axis=0).min() > 0.1
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["zero"], "does not name its task: give --task|does not name its task: give one"),
+        (["zero", "--task", "biped", "--out", "r.txt"], r"need \.json or \.csv \(nearest: r\.csv"),
+        (["zero", "--task", "biped", "--film", "r.gif"], r"is no \.mp4 \(nearest: r\.mp4"),
+        (["zero", "--task", "biped", "--dynamics.friction", "0.3"], "nearest: --robot.friction"),
+        (["zero", "--task", "biped", "--source-contract", "go1_joystick"], "would do nothing"),
+        (["zero", "--task", "jump"], "jump"),
+    ],
+)
+def test_refusals(words: list[str], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        run(*words)
+
+
+def test_nothing_of_others_is_replaced(tmp_path: Path) -> None:
+    for name in ("mine.csv", "mine.json"):
+        path = tmp_path / name
+        path.write_text("episode,value\n1,2\n")
+        with pytest.raises(files.FileError, match=r"not written by this command.*mine-2\."):
+            run("zero", "--task", "biped", "--out", str(path))
+        assert path.read_text() == "episode,value\n1,2\n"
+        again = ["zero", "--task", "biped", "--episodes", "1", "--out", str(path)]
+        assert run(*again, "--overwrite") == 0
+        assert run(*again) == 0
+    with pytest.raises(files.FileError, match="not written by this command"):
+        (tmp_path / "f.mp4").write_bytes(b"holiday")
+        run("zero", "--task", "biped", "--film", str(tmp_path / "f.mp4"))
+
+
+def test_a_film_of_the_first_episode(tmp_path: Path) -> None:
+    film = tmp_path / "hurdles.mp4"
+    words = ["zero", "--task", "hurdles", "--episodes", "1", "--film", str(film)]
+    assert run(*words) == 0
+    files.check_ours(film)
+    files.check_ours(film.with_suffix(".png"))
+
+
+def test_recorded_data_do_not_act(tmp_path: Path) -> None:
+    np.savez(tmp_path / "d.npz", obs=np.zeros((2, 101)), action=np.zeros((2, 12)))
+    with pytest.raises(ValueError, match=r"d\.npz"):
+        rehearse(str(tmp_path / "d.npz"), task="biped")
