@@ -6,8 +6,9 @@ TWIRL := .venv/bin/twirl
 PYTEST := .venv/bin/pytest
 CASE = $(if $(TASK),--task $(TASK)) $(if $(SHIFT),--shift $(SHIFT)) $(if $(SEED),--seed $(SEED))
 
-.PHONY: help setup bench-setup gpu-setup test-gpu test-jax-oldest gpu-counts gpu-proof lint format test test-slow train evaluate collect sweep figures \
-	report render demo bench curriculum clean
+.PHONY: help setup bench-setup gpu-setup lint format test test-slow test-gpu test-jax-oldest \
+	gpu-counts gpu-proof train evaluate collect sweep figures report render view demo bench \
+	curriculum docs dist clean
 
 help: ## show this table
 	@echo 'usage: make TARGET [TASK=..] [SHIFT=..] [SEED=..] [RUN=..] [GRID=..] [ARGS=".."]'
@@ -73,6 +74,9 @@ report: setup ## write the results as one HTML page
 render: setup ## film RUN=runs/NAME as mp4 and a strip of frames
 	$(TWIRL) render $(RUN) $(ARGS)
 
+view: setup ## watch RUN= (or the shipped biped) in a browser (ARGS="--html replay.html")
+	$(TWIRL) view $(RUN) $(ARGS)
+
 demo: setup ## render and evaluate the shipped policies; trains nothing
 	$(TWIRL) demo $(ARGS)
 
@@ -82,7 +86,18 @@ bench: bench-setup ## measure this machine, beside SBX
 curriculum: setup ## train the chain of TASK= with SEED= (ARGS="--shifts": without the shifts)
 	$(TWIRL) curriculum $(if $(TASK),--task $(TASK)) $(if $(SEED),--seed $(SEED)) $(ARGS)
 
+docs: ## build the pages and the API reference into build/site
+	@.ci/setup docs
+	.venv-docs/bin/python .ci/docs.py build/pages
+	NO_MKDOCS_2_WARNING=1 .venv-docs/bin/mkdocs build --strict -q -f .ci/mkdocs.yml
+	@echo 'open build/site/index.html'
+
+dist: setup ## build wheel and sdist into dist/, and try the wheel in an environment of its own
+	rm -rf dist
+	.venv/bin/python -m hatchling build -d dist
+	$(PYTEST) -m slow tests/test_dist.py
+
 clean: ## remove caches and build products (keeps .venv and runs/)
 	rm -rf build dist .pytest_cache .ruff_cache
-	find . -path ./.venv -prune -o -path ./.venv-bench -prune -o -path ./runs -prune -o \
+	find . -path ./.venv -prune -o -path ./.venv-bench -prune -o -path ./.venv-docs -prune -o -path ./runs -prune -o \
 		-name __pycache__ -type d -prune -exec rm -rf {} +

@@ -2,7 +2,15 @@
 
 from __future__ import annotations
 
+import base64
+import io
+import json
 import os
+import select
+import shutil
+import subprocess
+import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -24,6 +32,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from PIL import Image
 
 from twirl_mjx.training import source_rules
 from twirl_mjx.types import Transition
@@ -105,3 +114,128 @@ def decoded_ids(transitions: Transition) -> np.ndarray:
 def transition_code() -> tuple[Callable[..., Transition], Callable[[Transition], np.ndarray]]:
     """The pair ``coded_transitions``, ``decoded_ids``."""
     return coded_transitions, decoded_ids
+
+
+BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
+BROWSER_FLAGS = (
+    "--headless",
+    "--no-sandbox",
+    "--use-angle=swiftshader",  # WebGL without a graphics card
+    "--enable-unsafe-swiftshader",
+    "--window-size=1100,700",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+    "--remote-debugging-pipe",
+)
+# The browser reads commands from descriptor 3 and writes answers to descriptor 4.
+LAUNCH_BROWSER = (
+    "import os, sys; os.dup2(int(sys.argv[1]), 3); os.dup2(int(sys.argv[2]), 4);"
+    "os.execv(sys.argv[3], sys.argv[3:])"
+)
+
+
+class Browser:
+    """Just enough of the DevTools protocol: send a command, read messages up to its answer."""
+
+    def __init__(self, executable, profile):
+        to_browser, from_browser = os.pipe(), os.pipe()
+        inner = [os.dup(fd) if fd < 10 else fd for fd in (to_browser[0], from_browser[1])]
+        command = [
+            sys.executable,
+            "-c",
+            LAUNCH_BROWSER,
+            *map(str, inner),
+            executable,
+            *BROWSER_FLAGS,
+        ]
+        self.process = subprocess.Popen(
+            [*command, f"--user-data-dir={profile}", "about:blank"],
+            pass_fds=inner,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
+        for fd in {*inner, to_browser[0], from_browser[1]}:
+            os.close(fd)
+        self.writer, self.reader = to_browser[1], from_browser[0]
+        self.buffer, self.events, self.count, self.session = b"", [], 0, None
+
+    def message(self, deadline):
+        while b"\0" not in self.buffer:
+            if not select.select([self.reader], [], [], max(0.0, deadline - time.monotonic()))[0]:
+                raise TimeoutError("the browser did not answer")
+            chunk = os.read(self.reader, 1 << 20)
+            if not chunk:
+                raise EOFError(f"the browser ended with code {self.process.wait(10)}")
+            self.buffer += chunk
+        text, _, self.buffer = self.buffer.partition(b"\0")
+        return json.loads(text)
+
+    def send(self, method, **params):
+        self.count += 1
+        request = {"id": self.count, "method": method, "params": params}
+        request |= {"sessionId": self.session} if self.session else {}
+        os.write(self.writer, json.dumps(request).encode() + b"\0")
+        deadline = time.monotonic() + 60
+        while True:
+            answer = self.message(deadline)
+            if answer.get("id") == self.count:
+                assert "error" not in answer, answer
+                return answer["result"]
+            self.events.append(answer)
+
+    def wait_for(self, event):
+        deadline = time.monotonic() + 60
+        while not any(e.get("method") == event for e in self.events):
+            self.events.append(self.message(deadline))
+
+    def of(self, *methods):
+        return [e["params"] for e in self.events if e.get("method") in methods]
+
+    def open(self, url):
+        for domain in ("Page", "Runtime", "Log", "Network"):
+            self.send(f"{domain}.enable")
+        self.events = [e for e in self.events if e.get("method") != "Page.loadEventFired"]
+        self.send("Page.navigate", url=url)
+        self.wait_for("Page.loadEventFired")
+
+    def run(self, script):
+        result = self.send(
+            "Runtime.evaluate", expression=script, awaitPromise=True, returnByValue=True
+        )
+        assert "exceptionDetails" not in result, result
+        return result["result"].get("value")
+
+    def picture(self):
+        png = base64.b64decode(self.send("Page.captureScreenshot")["data"])
+        return np.asarray(Image.open(io.BytesIO(png)).convert("RGB"), float)
+
+    def errors(self):
+        return self.of("Runtime.exceptionThrown", "Runtime.consoleAPICalled", "Log.entryAdded")
+
+    def close(self):
+        self.process.terminate()
+        try:
+            self.process.wait(20)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            self.process.wait()
+        os.close(self.writer)
+        os.close(self.reader)
+
+
+@pytest.fixture
+def browser(tmp_path):
+    executable = next(filter(None, map(shutil.which, BROWSERS)), None)
+    if executable is None:
+        pytest.skip(
+            f"none of {', '.join(BROWSERS)} is installed; other tests check the files themselves"
+        )
+    browser = Browser(executable, tmp_path / "profile")
+    target = browser.send("Target.createTarget", url="about:blank")["targetId"]
+    attached = browser.send("Target.attachToTarget", targetId=target, flatten=True)
+    browser.session = attached["sessionId"]
+    yield browser
+    browser.close()

@@ -209,3 +209,31 @@ def test_output_that_nobody_reads_is_no_crash() -> None:
     run.stdout.close()
     assert "Traceback" not in run.communicate(timeout=120)[1]
     assert run.returncode in (0, 141)  # 0 where the whole text fits into the pipe's buffer
+
+
+@pytest.mark.parametrize("name", ["a b/x", "a b/x.mp4", "a b/x.png"])
+def test_a_name_with_its_ending_is_that_file(name: str) -> None:
+    assert render.stem_of(Path(name)) == Path("a b/x")
+    assert render.stem_of(Path("a b/x.1")) == Path("a b/x.1")
+
+
+@pytest.mark.parametrize(
+    ("argv", "ending"),
+    [
+        (["view", "--seconds", "0.1", "--html", "a ü.html"], "open it in any browser"),
+        (["figures", "--results", "no ü"], "no ü: no such directory"),
+    ],
+)
+def test_odd_surroundings_give_no_warning(argv: list[str], ending: str, tmp_path: Path) -> None:
+    """Blanks and other letters in paths, no locale, no home: the one line, and nothing else."""
+    folder = tmp_path / "some ü folder"
+    folder.mkdir()
+    odd = {"LC_ALL": "C", "HOME": "/proc/nowhere", "PATH": os.environ["PATH"]}
+    odd["PYTHONPATH"] = str(Path(__file__).resolve().parents[1])
+    done = subprocess.run(
+        [sys.executable, "-m", "twirl_mjx", *argv],
+        cwd=folder, env=odd, timeout=200,
+        capture_output=True, text=True, encoding="utf-8", check=False,
+    )  # fmt: skip
+    lines = (done.stdout + done.stderr).splitlines()
+    assert len(lines) == 1 and ending in lines[0], lines

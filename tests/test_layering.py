@@ -42,11 +42,12 @@ ALLOWED: dict[str, set[str]] = {
     "evaluation": ACTING,
     "training": ACTING | {"evaluation", "replay"},
     "deploy": ACTING | {"evaluation", "figures"},
+    "view": BASE | {"sim", "policies", "deploy"},
     "figures": {"checks", "files"},
     "sweep": ACTING | {"training", "figures"},
     "bench": ACTING | {"evaluation", "replay", "training", "deploy", "figures"},
     "commands": ACTING
-    | {"evaluation", "replay", "training", "deploy", "figures", "sweep", "bench"},
+    | {"evaluation", "replay", "training", "deploy", "view", "figures", "sweep", "bench"},
 }
 """What each part may import of ours, besides itself; ``cli`` and the package root: everything."""
 

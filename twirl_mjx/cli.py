@@ -11,7 +11,7 @@ import traceback
 from collections.abc import Callable
 from typing import Any
 
-from twirl_mjx import exits, faults, machine
+from twirl_mjx import __version__, exits, faults, machine
 from twirl_mjx.cache import LEAST_COMPILE_S, cache_folder
 from twirl_mjx.checks import nearest
 from twirl_mjx.commands.waiting import waiting
@@ -29,6 +29,7 @@ COMMANDS = {
     "report": "write the results as one HTML page",
     "bench": "measure learner, worlds and start-up on this machine",
     "rehearse": "run a policy in an independent simulator with latency and noise",
+    "view": "watch a policy in a browser and touch it, or write a replay page",
     "demo": "render and evaluate the shipped policies; trains nothing",
     "runs": "list, show, compare and prune runs",
     "curriculum": "train the chain of tasks one after another",
@@ -43,7 +44,8 @@ def _usage() -> str:
     rows = "\n".join(f"  {name:<{width}}  {about}" for name, about in COMMANDS.items())
     return (
         "usage: twirl COMMAND [options]\n\ncommands:\n"
-        f"{rows}\n\n`twirl COMMAND --help` lists the options of a command.\n"
+        f"{rows}\n\n`twirl COMMAND --help` lists the options of a command, `twirl --version` says"
+        " which this is.\n"
     )
 
 
@@ -56,6 +58,7 @@ def _set_environment() -> None:
         os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(folder))
         os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", str(LEAST_COMPILE_S))
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
+    logging.getLogger("matplotlib").setLevel(logging.ERROR)  # where HOME cannot be written
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # Ray would report to its makers
 
 
@@ -131,6 +134,9 @@ def main(argv: list[str] | None = None) -> int:
         print(_usage(), end="")
         return 0 if argv else exits.UNUSABLE
     name, *rest = argv
+    if name == "--version":
+        print(f"twirl {__version__}")
+        return 0
     if name not in COMMANDS:
         close = nearest(name, COMMANDS)
         print(f"twirl: unknown command {name!r} (nearest: {close!r})\n", file=sys.stderr)

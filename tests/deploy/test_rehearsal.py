@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from twirl_mjx.deploy import rehearsal as module
+from twirl_mjx.deploy import trial as module
+from twirl_mjx.deploy.ground import build_model
 from twirl_mjx.deploy.rehearsal import IDEAL, RehearsalConfig, rehearse
-from twirl_mjx.deploy.robot import CommandFilter, Contacts, Sensors, build_model, motor_torque
+from twirl_mjx.deploy.robot import CommandFilter, Contacts, Sensors, motor_torque
 from twirl_mjx.policies.learned import PolicyHeader, save_policy
 from twirl_mjx.policies.scripted import BOUND, TROT, ClockedGait
 
@@ -197,7 +198,9 @@ def test_bad_requests_are_refused() -> None:
     ("changes", "message"),
     [
         ({"sim_dt": 0.003}, "does not divide the control step"),
-        ({"latency_ms": -1.0}, r"in \[0, 200\], got -1.0"),
+        ({"latency_ms": -1.0}, r"latency_ms = -1\.0 is outside \[0\.0, 200\.0\]"),
+        ({"gravity": 0.0}, r"gravity = 0\.0 is outside .*nearest: 0\.01"),
+        ({"bump_height": 0.05, "incline_deg": 8.0}, "nearest: incline_deg 0"),
         ({"full_torque_speed": 30.0}, r"below no_load_speed 21\.0"),
         ({"rate_noise": -0.1}, "rate_noise must not be negative"),
     ],

@@ -12,9 +12,9 @@ import pytest
 from PIL import Image
 
 from twirl_mjx.deploy import render
+from twirl_mjx.deploy.ground import build_model
 from twirl_mjx.deploy.rehearsal import IDEAL
 from twirl_mjx.deploy.render import look_at_path, render_frames
-from twirl_mjx.deploy.robot import build_model
 from twirl_mjx.deploy.video import overlay_text, strip_indices, write_strip, write_video
 from twirl_mjx.sim import gl as gl_probe
 from twirl_mjx.sim.draw import CameraView, SceneRenderer

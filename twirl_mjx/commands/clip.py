@@ -14,6 +14,7 @@ from twirl_mjx import files
 from twirl_mjx.assets import asset_path
 from twirl_mjx.checks import check_choice
 from twirl_mjx.commands.console import parse, say
+from twirl_mjx.commands.render import stem_of
 from twirl_mjx.motion.leap_config import LeapConfig
 
 if TYPE_CHECKING:
@@ -67,7 +68,7 @@ class ShowOptions(CheckOptions):
 
     out: Path = Path("runs/clip")
     """Writes <out>.png, <out>-film.mp4 and .png and, for several clips, <out>-compare.png; with or
-    without the ending .png."""
+    without an ending."""
     source: str = ""
     """Where the other clips come from, written into the comparison."""
     overwrite: bool = False
@@ -140,7 +141,7 @@ def _make(argv: list[str], set_up: Callable[[bool], None]) -> int:
 
 def _show(argv: list[str], set_up: Callable[[bool], None]) -> int:
     options = parse(ShowOptions, argv, "twirl clip show")
-    stem = options.out.with_suffix("") if options.out.suffix == ".png" else options.out
+    stem = stem_of(options.out)
     endings = (
         ".png",
         "-film.mp4",

@@ -11,7 +11,7 @@ from twirl_mjx import files
 from twirl_mjx.assets import asset_path
 from twirl_mjx.checks import check_range
 from twirl_mjx.commands.console import parse, say
-from twirl_mjx.commands.render import FILM_SECONDS, RenderOptions, config_of, film
+from twirl_mjx.commands.render import FILM_SECONDS, RenderOptions, config_of, film, record
 
 
 @dataclasses.dataclass(frozen=True)
@@ -23,13 +23,13 @@ class DemoOptions:
     seed: int = 3_000_017
     """Seed of the episodes."""
     out: Path = Path("runs/demo")
-    """Folder of the films."""
+    """Folder of the films and replays."""
     film: bool = True
-    """Also film one episode of each."""
+    """Also film one episode of each, and write it as a page that replays it."""
     seconds: float = 10.0
     """Longest film."""
     overwrite: bool = False
-    """Replace films and strips that this command did not write."""
+    """Replace films, strips and pages that this command did not write."""
 
 
 def main(argv: list[str], set_up: Callable[[bool], None]) -> int:
@@ -52,10 +52,13 @@ def main(argv: list[str], set_up: Callable[[bool], None]) -> int:
     if not found:
         raise FileNotFoundError(f"no policy in {folder}: train one with `twirl train`")
     for path in found if options.film else ():
-        for ending in (".mp4", ".png"):
+        for ending in (".mp4", ".png", ".html"):
             files.check_ours(options.out / f"{path.stem}{ending}", overwrite=options.overwrite)
     for path in found:
         _show(path, options)
+    if options.film:
+        say(f"open {options.out}/*.html in a browser to turn, stop and slow what was filmed")
+        say("`twirl view` lets you push the robot and move its goal")
     return 0
 
 
@@ -68,7 +71,8 @@ def _show(path: Path, options: DemoOptions) -> None:
     from twirl_mjx.worlds.make import make_env
 
     began = time.monotonic()
-    say(f"{path.stem}: evaluating {options.episodes} episodes" + ", then filming" * options.film)
+    then = ", then filming one and writing its replay" * options.film
+    say(f"{path.stem}: evaluating {options.episodes} episodes{then}")
     config = config_of(str(path), None)
     env = make_env(config, num_envs=options.episodes)
     evaluate = evaluate_policy(env, resolve_policy(str(path), config).policy)
@@ -76,8 +80,13 @@ def _show(path: Path, options: DemoOptions) -> None:
     means = ", ".join(f"{name} {value:.3g}" for name, value in episode_means(values).items())
     say(f"{path.stem}: {means}")
     if options.film:
+        from twirl_mjx.commands.view import write_recording
+
         wanted = RenderOptions(
             str(path), seed=options.seed, seconds=options.seconds, overwrite=options.overwrite
         )
-        film(config, wanted, options.out / path.stem)
+        recording = record(config, wanted)
+        film(config, recording, options.out / path.stem, wanted)
+        page = options.out / f"{path.stem}.html"
+        write_recording(page, config, recording, title=path.stem, overwrite=options.overwrite)
     say(f"{path.stem}: {time.monotonic() - began:.0f} s")

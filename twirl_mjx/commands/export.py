@@ -9,7 +9,6 @@ from typing import Annotated
 import tyro
 
 from twirl_mjx.commands.console import parse, say
-from twirl_mjx.deploy.export import export
 
 
 @dataclasses.dataclass(frozen=True)
@@ -29,6 +28,8 @@ class ExportOptions:
 def main(argv: list[str]) -> int:
     """Export."""
     options = parse(ExportOptions, argv, "twirl export")
+    from twirl_mjx.deploy.export import export
+
     done = export(options.policy, options.out, robot=options.robot, overwrite=options.overwrite)
     say(f"wrote {done.onnx}")
     say(f"wrote {done.contract}" if done.contract else f"no contract: {done.why}")

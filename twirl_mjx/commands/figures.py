@@ -7,6 +7,7 @@ from pathlib import Path
 
 from twirl_mjx import files
 from twirl_mjx.commands.console import parse, say
+from twirl_mjx.commands.waiting import waiting
 
 
 @dataclasses.dataclass(frozen=True)
@@ -25,9 +26,9 @@ class FiguresOptions:
 
 def main(argv: list[str]) -> int:
     """Draw everything there is data for."""
-    from twirl_mjx.figures.plots import make_figures
-
     options = parse(FiguresOptions, argv, "twirl figures")
+    with waiting("loading matplotlib"):
+        from twirl_mjx.figures.plots import make_figures
     for path in make_figures(options.results, options.out, overwrite=options.overwrite):
         say(f"wrote {path}")
         if (page := options.shown / path.name).is_file():

@@ -44,7 +44,8 @@ class RenderOptions:
     panels: int = 8
     """Frames in the strip."""
     out: Path | None = None
-    """Path without ending; <run>/episode, or runs/<policy>-<task>, by default."""
+    """Path of mp4 and strip, with or without their ending; <run>/episode, or
+    runs/<policy>-<task>, by default."""
     source_contract: str = ""
     """How a foreign policy meets the robot, by name or file (docs/sources.md)."""
     source_command: str = ""
@@ -81,20 +82,20 @@ def main(argv: list[str], set_up: Callable[[bool], None]) -> int:
         config = dataclasses.replace(config, shift=options.shift)
     path = Path(options.policy)
     named = Path("runs") / f"{name_of(options.policy)}-{config.task}"
-    film(config, options, options.out or (path / "episode" if path.is_dir() else named))
+    stem = stem_of(options.out or (path / "episode" if path.is_dir() else named))
+    check_film(stem, options)
+    film(config, record(config, options), stem, options)
     return 0
 
 
-def film(config: WorldConfig, options: RenderOptions, stem: Path) -> Path:
-    """Write ``<stem>.mp4`` and ``<stem>.png``; return the strip's path.
+def stem_of(path: Path) -> Path:
+    """Return the common part of the names of a film and its strip, given any of them."""
+    return path.with_suffix("") if path.suffix in (".mp4", ".png") else path
 
-    Raises:
-        FileError: One of them is there and was not written by this project.
-    """
-    for ending in (".mp4", ".png"):
-        files.check_ours(stem.parent / f"{stem.name}{ending}", overwrite=options.overwrite)
-    from twirl_mjx.deploy.render import render_episode
-    from twirl_mjx.evaluation.record import record_episode, scene_model
+
+def record(config: WorldConfig, options: RenderOptions) -> Recording:
+    """Return one episode of a policy, and say what should be known of it."""
+    from twirl_mjx.evaluation.record import record_episode
     from twirl_mjx.policies.resolve import Terms, resolve_policy
     from twirl_mjx.sim.robots import ROBOTS
 
@@ -102,14 +103,35 @@ def film(config: WorldConfig, options: RenderOptions, stem: Path) -> Path:
     found = resolve_policy(options.policy, config, terms=terms)
     for note in found.notes:
         say(f"{options.policy}: {note}")
-    control_dt = ROBOTS.get(config.robot).control_dt
-    steps = min(config.episode_length, round(options.seconds / control_dt))
-    recording = record_episode(config, found.policy, seed=options.seed, steps=steps)
+    steps = min(config.episode_length, round(options.seconds / ROBOTS.get(config.robot).control_dt))
+    return record_episode(config, found.policy, seed=options.seed, steps=steps)
+
+
+def check_film(stem: Path, options: RenderOptions) -> None:
+    """Check that a film and its strip can be written.
+
+    Raises:
+        FileError: One of them is there and was not written by this project.
+    """
+    for ending in (".mp4", ".png"):
+        files.check_ours(stem.parent / f"{stem.name}{ending}", overwrite=options.overwrite)
+
+
+def film(config: WorldConfig, recording: Recording, stem: Path, options: RenderOptions) -> Path:
+    """Write ``<stem>.mp4`` and ``<stem>.png``; return the strip's path.
+
+    Raises:
+        FileError: As :func:`check_film`.
+    """
+    check_film(stem, options)
+    from twirl_mjx.deploy.render import render_episode
+    from twirl_mjx.evaluation.record import scene_model
+
     video, strip = render_episode(
         scene_model(config, recording),
         recording.qpos,
         stem,
-        frame_dt=control_dt,
+        frame_dt=recording.robot.control_dt,
         panels=options.panels,
         goals=recording.goals if config.task_type.shows_goal else None,
         captions=captions(config, recording),

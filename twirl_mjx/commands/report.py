@@ -7,6 +7,7 @@ from pathlib import Path
 
 from twirl_mjx import files
 from twirl_mjx.commands.console import parse, say
+from twirl_mjx.commands.waiting import waiting
 
 
 @dataclasses.dataclass(frozen=True)
@@ -25,9 +26,9 @@ class ReportOptions:
 
 def main(argv: list[str]) -> int:
     """Write the page."""
-    from twirl_mjx.figures.report import write_report
-
     options = parse(ReportOptions, argv, "twirl report")
     files.check_ours(options.out, overwrite=options.overwrite)
-    say(f"wrote {write_report(options.results, options.out, options.media)}")
+    with waiting("loading matplotlib"):
+        from twirl_mjx.figures.report import write_report
+    say(f"wrote {write_report(options.results, options.out, options.media, say=say)}")
     return 0

@@ -1,11 +1,28 @@
-"""Under which conditions a rehearsal runs: physics step, latency, noise, motors, course."""
+"""How far a rehearsal is from the ideal loop: its settings, their ranges and the paper's shifts."""
 
 from __future__ import annotations
 
 import dataclasses
 from typing import Literal
 
+from twirl_mjx.checks import check_range
+
 CONTROL_HZ = 20
+
+RANGES = {
+    "latency_ms": (0.0, 200.0),
+    "noise": (0.0, 20.0),
+    "torque_limit": (0.1, 200.0),
+    "leg_strength": (0.05, 1.0),
+    "friction": (0.01, 4.0),
+    "gravity": (0.01, 30.0),
+    "payload": (-1.0, 10.0),
+    "incline_deg": (0.0, 20.0),
+    "bump_height": (0.0, 0.1),
+    "hurdle_gap": (0.3, 10.0),
+    "hurdle_height": (0.001, 0.2),
+}
+"""Lowest and highest values of a rehearsal's conditions, in the units of its fields."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -30,6 +47,8 @@ class RehearsalConfig:
     """Standard deviation of the measured joint velocities, rad/s; of foreign policies only."""
     position_drift: float = 0.01
     """Random walk of the estimated base position, m per square root of a second."""
+    noise: float = 1.0
+    """Scale of all noise and drift."""
     torque_limit: float = 33.5
     """Motor torque limit, N m (URDF)."""
     full_torque_speed: float = 10.5
@@ -40,14 +59,28 @@ class RehearsalConfig:
     """Position gain, N m/rad."""
     kd: float = 3.0
     """Velocity gain, N m s/rad."""
+    weak_leg: Literal["none", "FR", "FL", "RR", "RL"] = "none"
+    """Leg whose motors are weak."""
+    leg_strength: float = 0.5
+    """Torque limit and gains of the weak leg, as a share of the others'."""
     friction: float = 1.0
     """Friction coefficient between feet and ground."""
+    gravity: float = 9.81
+    """Downward acceleration, m/s^2."""
+    payload: float = 0.0
+    """Mass added at the trunk's centre of mass, kg."""
+    incline_deg: float = 0.0
+    """Angle of the hill that begins 0.5 m ahead, deg."""
+    bump_height: float = 0.0
+    """Highest point of a ground of random bumps, m; not with hurdles, nor with a hill."""
     episode_s: float = 20.0
     """Length of an episode, s."""
     goal_distance: float | None = 1.0
     """Distance of the biped's goal, m, in a random direction; ``None`` draws it as in training."""
     hurdle_gap: float | None = None
     """Distance between hurdles, m; ``None`` draws every gap from U(1.6, 2.6) m."""
+    hurdle_height: float = 0.01
+    """Height of a hurdle band, m."""
     height_of: Literal["root", "front_feet"] = "front_feet"
     """Height that ``stand`` rewards."""
 
@@ -60,8 +93,6 @@ class RehearsalConfig:
                 f"sim_dt {self.sim_dt} s does not divide the control step of 0.05 s (nearest:"
                 f" {nearest:.6g})"
             )
-        if not 0.0 <= self.latency_ms <= 200.0:
-            raise ValueError(f"latency_ms must be in [0, 200], got {self.latency_ms}")
         if not 0.0 <= self.full_torque_speed < self.no_load_speed:
             raise ValueError(
                 f"full_torque_speed {self.full_torque_speed} rad/s must be at least 0 and below "
@@ -70,6 +101,14 @@ class RehearsalConfig:
         for name in (f.name for f in dataclasses.fields(self) if f.name.endswith("_noise")):
             if getattr(self, name) < 0.0:
                 raise ValueError(f"{name} must not be negative, got {getattr(self, name)}")
+        for name, (low, high) in RANGES.items():
+            if (value := getattr(self, name)) is not None:
+                check_range(name, value, low, high)
+        if self.bump_height and self.incline_deg:
+            raise ValueError(
+                f"bump_height {self.bump_height} m and incline_deg {self.incline_deg} exclude each"
+                " other (nearest: incline_deg 0)"
+            )
 
     @property
     def n_substeps(self) -> int:
@@ -96,3 +135,21 @@ IDEAL = RehearsalConfig(
     goal_distance=None,
 )
 """No latency, no noise, torque limit only: the training task in C MuJoCo at 1 ms."""
+
+SHIFTS: dict[str, dict[str, float | str]] = {
+    "none": {},
+    "bumpy": {"bump_height": 0.05},
+    "icy": {"friction": 0.4},
+    "weakened": {"weak_leg": "RR", "leg_strength": 0.5},
+    "sloped": {"incline_deg": 8.0},
+    "gravity": {"gravity": 3.7},
+}
+"""The paper's conditions as changes of a config (docs/shifts.md; the weak leg is always the same
+one at its weakest, and motors do not heat)."""
+LIVE = (
+    "latency_ms", "torque_limit", "full_torque_speed", "no_load_speed", "kp", "kd", "weak_leg",
+    "leg_strength", "friction", "gravity", "payload", "orientation_noise", "rate_noise",
+    "joint_noise", "position_noise", "velocity_noise", "joint_velocity_noise", "position_drift",
+    "noise", "episode_s",
+)  # fmt: skip
+"""Settings that may change while an episode runs; the others shape the scene or its score."""

@@ -138,9 +138,16 @@ class FollowScore(Score):
         assert self.clip is not None, "made with a clip"
         self._reference = Reference(self.clip, position)
 
-    def step(self, qpos: np.ndarray, qvel: np.ndarray, feet: np.ndarray, goal: np.ndarray) -> float:
+    def step(
+        self,
+        qpos: np.ndarray,
+        qvel: np.ndarray,
+        feet: np.ndarray,
+        goal: np.ndarray,
+        ground: float = 0.0,
+    ) -> float:
         """Score one control step; arguments as :meth:`Score.step`."""
-        del goal
+        del goal, ground
         reference = self._reference
         assert reference is not None, "started"
         leaps = reference.leaps

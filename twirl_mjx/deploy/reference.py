@@ -125,7 +125,14 @@ class Score:
         """Note the distance to the goal before the first step."""
         self.previous_distance = self.min_distance = float(np.linalg.norm(goal - position[:2]))
 
-    def step(self, qpos: np.ndarray, qvel: np.ndarray, feet: np.ndarray, goal: np.ndarray) -> float:
+    def step(
+        self,
+        qpos: np.ndarray,
+        qvel: np.ndarray,
+        feet: np.ndarray,
+        goal: np.ndarray,
+        ground: float = 0.0,
+    ) -> float:
         """Score one control step.
 
         Args:
@@ -133,6 +140,7 @@ class Score:
             qvel: [18] true velocities at its end.
             feet: [4] m, height of the lowest point of the feet over the ground, front ones first.
             goal: [2] m, goal of the step.
+            ground: height of the ground under the base, m.
 
         Returns:
             The reward.
@@ -147,7 +155,7 @@ class Score:
             reward = self._hurdles(qpos, qvel)
         else:
             foot_centre = float(front_feet.mean()) + 0.02
-            height = foot_centre if self._rewards_front_feet() else qpos[2]
+            height = foot_centre if self._rewards_front_feet() else qpos[2] - ground
             reward = (0.5 * cosine + 0.5) ** 2 + np.exp(height) - 1.0
         if self.task == "biped":
             facing = -rotation[:2, 2] @ to_goal / max(distance, 1e-6)

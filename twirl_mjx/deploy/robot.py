@@ -1,4 +1,4 @@
-"""The rehearsal's robot: physics model, motors, command filter, sensors and contacts.
+"""The rehearsal's robot: motors, command filter, sensors and contacts.
 
 Numbers are written out here once more on purpose: a rehearsal shares no code with the training
 simulation, only the robot's MJCF file.
@@ -9,71 +9,30 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
-from twirl_mjx.assets import asset_path
 from twirl_mjx.deploy.conditions import CONTROL_HZ, RehearsalConfig
 from twirl_mjx.deploy.reference import FALL_PARTS, Reading, quaternion_matrix
 
+LEGS = ("FR", "FL", "RR", "RL")
 POSE = np.tile([0.0, 0.9, -1.8], 4)
 SWING = np.tile([0.6, 1.2, 1.2], 4)
 LOWER = np.tile([-0.802851455917, -1.0471975512, -2.69653369433], 4)
-UPPER = np.tile([0.802851455917, 4.18879020479, -0.916297857297], 4)
 KNEE_RADIUS = 0.015
 """m, of the calf at the knee."""
-BAND_HALF_SIZE = (0.1, 20.0, 0.005)
-"""m, half extents of a hurdle band: 0.2 m long, endless for the robot, 0.01 m tall."""
+UPPER = np.tile([0.802851455917, 4.18879020479, -0.916297857297], 4)
 
 
-def build_model(config: RehearsalConfig, hurdles: np.ndarray) -> mujoco.MjModel:
-    """Compile robot, floor and hurdle bands; the actuators become plain torque motors.
-
-    Args:
-        config: physics step and friction.
-        hurdles: [K] m, x of the band centres.
-    """
-    spec = mujoco.MjSpec.from_file(str(asset_path("a1", "a1.xml")))
-    spec.option.timestep = config.sim_dt
-    spec.option.iterations, spec.option.ls_iterations = 50, 50
-    for geom in spec.geoms:
-        if geom.name.endswith(("_collision", "_foot")):
-            geom.conaffinity = 1
-    ground = {"contype": 1, "conaffinity": 0, "priority": 1}
-    spec.worldbody.add_geom(
-        name="floor",
-        type=mujoco.mjtGeom.mjGEOM_PLANE,
-        size=[0, 0, 0.05],
-        friction=[config.friction, 0.005, 0.0001],
-        rgba=[0.78, 0.81, 0.84, 1.0],
-        **ground,
-    )
-    for i, x in enumerate(hurdles):
-        spec.worldbody.add_geom(
-            name=f"hurdle_{i}",
-            type=mujoco.mjtGeom.mjGEOM_BOX,
-            size=list(BAND_HALF_SIZE),
-            pos=[x, 0.0, BAND_HALF_SIZE[2]],
-            rgba=[0.90, 0.33, 0.12, 1.0],
-            **ground,
-        )
-    sun = mujoco.mjtLightType.mjLIGHT_DIRECTIONAL
-    spec.worldbody.add_light(pos=[0, 0, 5], dir=[0.2, 0.3, -1.0], type=sun, castshadow=True)
-    spec.add_texture(
-        name="sky",
-        type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
-        builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT,
-        rgb1=[0.93, 0.96, 1.0],
-        rgb2=[0.55, 0.66, 0.78],
-        width=64,
-        height=64,
-    )
-    model = spec.compile()
-    model.actuator_gainprm[:], model.actuator_biasprm[:] = 0.0, 0.0
-    model.actuator_gainprm[:, 0] = 1.0
-    model.actuator_ctrllimited[:] = model.actuator_forcelimited[:] = 0
-    return model
+def motor_shares(config: RehearsalConfig) -> np.ndarray:
+    """Return the share [12] of torque limit and gains that every motor has, order of the legs."""
+    legs = [config.leg_strength if leg == config.weak_leg else 1.0 for leg in LEGS]
+    return np.repeat(legs, 3)
 
 
 def motor_torque(
-    config: RehearsalConfig, target: np.ndarray, joint_pos: np.ndarray, joint_vel: np.ndarray
+    config: RehearsalConfig,
+    target: np.ndarray,
+    joint_pos: np.ndarray,
+    joint_vel: np.ndarray,
+    share: np.ndarray | float = 1.0,
 ) -> np.ndarray:
     """Return the torque of a PD law behind a torque-speed limit, N m [12].
 
@@ -86,11 +45,12 @@ def motor_torque(
         target: [12] rad.
         joint_pos: [12] rad.
         joint_vel: [12] rad/s.
+        share: [12] of gains and limits that a motor has.
     """
     span = config.no_load_speed - config.full_torque_speed
     up = config.torque_limit * np.clip((config.no_load_speed - joint_vel) / span, 0.0, 1.0)
     down = config.torque_limit * np.clip((config.no_load_speed + joint_vel) / span, 0.0, 1.0)
-    return np.clip(config.kp * (target - joint_pos) - config.kd * joint_vel, -down, up)
+    return share * np.clip(config.kp * (target - joint_pos) - config.kd * joint_vel, -down, up)
 
 
 class CommandFilter:
@@ -117,13 +77,20 @@ class Sensors:
     """Reads the simulated robot with noise and drift."""
 
     def __init__(self, config: RehearsalConfig, rng: np.random.Generator) -> None:
-        self._config, self._rng = config, rng
+        self.config, self._rng = config, rng
         self._more = rng.spawn(1)[0]  # what is drawn for foreign policies changes nothing else
         self._drift = np.zeros(3)
 
     def read(self, data: mujoco.MjData) -> Reading:
         """Return the reading of one control step."""
-        c, normal, more = self._config, self._rng.standard_normal, self._more.standard_normal
+        c = self.config
+
+        def normal(size: int) -> np.ndarray:
+            return c.noise * self._rng.standard_normal(size)
+
+        def more(size: int) -> np.ndarray:
+            return c.noise * self._more.standard_normal(size)
+
         self._drift += c.position_drift / np.sqrt(CONTROL_HZ) * normal(3)
         turn = c.orientation_noise * normal(3)
         small = np.concatenate([[1.0], 0.5 * turn])

@@ -70,7 +70,7 @@ def write_report(
         output_path: The HTML file, replaced if it exists.
         media: Clips and pictures in the order of the page.
         title: Heading of the page.
-        say: Called with one line per grid that is left out.
+        say: Called with one line per grid that is left out, and before a grid is drawn.
 
     Returns:
         The file written.
@@ -83,10 +83,10 @@ def write_report(
     clips = [m if isinstance(m, Media) else Media(Path(m)) for m in media]
     if not grids and not clips:
         raise TableError(f"{results_dir}: no rows and no clips, nothing to report")
-    sections = [
-        (grid, _facts(tables).title or f"Grid: {grid}", _grid_html(grid, *tables))
-        for grid, tables in grids.items()
-    ]
+    sections = []
+    for i, (grid, tables) in enumerate(grids.items()):
+        say(f"drawing grid '{grid}', {i + 1} of {len(grids)}")
+        sections.append((grid, _facts(tables).title or f"Grid: {grid}", _grid_html(grid, *tables)))
     if clips:
         shown = "".join(page.clip(m) for m in clips)
         sections.insert(1, ("clips", "Clips", f'<div class="clips">{shown}</div>'))

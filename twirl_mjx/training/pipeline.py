@@ -405,7 +405,10 @@ def source_data(config: TrainConfig, run_dir: RunDir, source: Source, say: Say) 
                 " (nearest: another --name, or move the file and name it with --source)"
             )
         say(f"{path} was collected for other settings: collecting again")
-    say(f"stage 2 of 3: collecting {size:,} transitions of {source.origin} in {config.task}")
+    say(
+        f"stage 2 of 3: collecting {size:,} transitions of {source.origin} in {config.task}"
+        ", once its worlds are compiled"
+    )
     data = write_dataset(config, source, path, digest, say)
     return ring.from_transitions(jax.tree.map(jnp.asarray, data))
 
@@ -437,7 +440,7 @@ def write_dataset(config: TrainConfig, source: Source, path: Path, digest: str, 
     env = make_env(config.evaluation, num_envs=_collecting_worlds(config))
     key = jax.random.fold_in(jax.random.key(config.seed), 0x50)
     limit = 1.0 if config.allow_clipping else MAX_CLIPPED
-    data, means = collect(env, source.policy, key, size, max_clipped=limit)
+    data, means = collect(env, source.policy, key, size, max_clipped=limit, say=say)
     if clipped := means.pop("clipped", 0.0):
         say(f"{clipped:.1%} of the source's joint targets lay outside the action box: clipped")
     say("source policy in the target task: " + describe(means))

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import functools
+import time
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -15,6 +17,8 @@ from twirl_mjx.worlds.vector import FAULTS, VectorEnv, make_transition
 
 ROUNDING = 1e-3
 """By which an action may leave [-1, 1] and not count as clipped."""
+PROGRESS_S = 5.0
+"""s between lines of progress."""
 
 
 def collect(
@@ -24,6 +28,7 @@ def collect(
     size: int,
     *,
     max_clipped: float = 1.0,
+    say: Callable[[str], None] = lambda line: None,
 ) -> tuple[Transition, dict[str, float]]:
     """Return exactly ``size`` transitions of ``policy`` acting in ``env``.
 
@@ -35,6 +40,7 @@ def collect(
         key: Seeds worlds and policy.
         size: Transitions wanted.
         max_clipped: Largest share of joint targets outside the action box.
+        say: Gets a line of progress every ``PROGRESS_S``.
 
     Returns:
         Transitions [size, ...] (numpy) and the mean measures of the episodes that ended (none
@@ -52,10 +58,10 @@ def collect(
     run = jax.jit(functools.partial(_collect_chunk, env, policy, chunk))
     rows: list[Transition] = []
     kept = dropped = 0
-    cause = ""
-    outside = 0.0
+    cause, outside, tell = "", 0.0, _progress(size, say)
     sums: dict[str, float] = {}
     while kept < size:
+        tell(kept)
         key, chunk_key = jax.random.split(key)
         carry, (transitions, fault, ended, values, beyond) = run(carry, chunk_key)
         fault = np.asarray(fault)
@@ -88,6 +94,19 @@ def check_dropped(dropped: int, kept: int, size: int, cause: str) -> None:
             f"{dropped:,} of {kept + dropped:,} steps of the source were dropped, more than"
             f" {MAX_DROPPED:.0%} of the {size:,} that are wanted; the first one because {cause}"
         )
+
+
+def _progress(size: int, say: Callable[[str], None]) -> Callable[[int], None]:
+    """Return what is called with the number of transitions so far and now and then says it."""
+    told = time.monotonic()
+
+    def tell(kept: int) -> None:
+        nonlocal told
+        if time.monotonic() - told > PROGRESS_S:
+            told = time.monotonic()
+            say(f"collected {kept:,} of {size:,} transitions")
+
+    return tell
 
 
 def check_clipped(share: float, limit: float) -> None:

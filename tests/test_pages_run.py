@@ -1,0 +1,204 @@
+"""What the pages tell people to type: command lines are understood, Python runs as it stands."""
+
+from __future__ import annotations
+
+import ast
+import contextlib
+import importlib
+import json
+import os
+import re
+import shlex
+import subprocess
+import sys
+import textwrap
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import twirl_mjx
+from twirl_mjx import cli
+from twirl_mjx.commands import console
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGES = [
+    *(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "experiments/README.md")),
+    *sorted((ROOT / "docs").glob("*.md")),
+    ROOT / "assets" / "policies" / "README.md",
+]
+FENCE = re.compile(r"^ *```(\w*)[^\n]*\n(.*?)^ *```", re.M | re.S)
+INLINE = re.compile(r"(?<!`)`([^`]+)`(?!`)")
+COMMAND = re.compile(r"(?:\.venv/bin/)?(?:twirl|make) [a-z]")
+PLACEHOLDER = re.compile(r"\.\.\.|…|\b[A-Z]{2,}\b(?!=)|=\.\.|[$\[{<|>]|\bmy[_.]|/mine\b|\bX\b")
+"""What stands for something else: `make render RUN=runs/NAME`, `twirl sweep my_grid.py`."""
+
+
+def blocks(page: Path, *languages: str) -> Iterator[str]:
+    for language, text in FENCE.findall(page.read_text(encoding="utf-8")):
+        if language in languages:
+            yield textwrap.dedent(text)
+
+
+def commands(page: Path) -> Iterator[str]:
+    """Yield the command lines of `twirl` and `make` of a page, each on one line."""
+    for block in blocks(page, "sh", "bash", "console"):
+        for line in block.replace("\\\n", " ").splitlines():
+            yield re.sub(r"(^|\s)#.*", "", line).strip()
+    prose = FENCE.sub("", page.read_text(encoding="utf-8"))
+    for code in INLINE.findall(prose):
+        if len(code.split()) > 2:  # `twirl render` is a name
+            yield " ".join(code.split())
+
+
+LINES = sorted(
+    {
+        line
+        for page in PAGES
+        for line in commands(page)
+        if COMMAND.match(line) and not PLACEHOLDER.search(line)
+    }
+)
+
+
+class Understood(BaseException):
+    """The options of a command fit; it is not run."""
+
+
+def understood(argv: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let a command parse its options and stop there."""
+    parse = console.tyro.cli
+
+    def only_parse(*args: Any, **more: Any) -> None:
+        parse(*args, **more)
+        raise Understood
+
+    monkeypatch.setattr(console.tyro, "cli", only_parse)
+    monkeypatch.setattr(cli, "probe_gl", lambda environ: "disable")
+    monkeypatch.setenv("MUJOCO_GL", "disable")
+    with contextlib.suppress(Understood):
+        assert cli.main(argv) == 0, argv
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("line", LINES)
+def test_command_lines_are_understood(
+    line: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(ROOT)
+    if line.startswith("make"):
+        made = subprocess.run(
+            ["make", "-n", *shlex.split(line)[1:]], capture_output=True, text=True, check=False
+        )
+        assert made.returncode == 0, made.stderr
+        found = re.findall(r"^\.venv/bin/(twirl .*)$", made.stdout.replace("\\\n", " "), re.M)
+    else:
+        found = [line.removeprefix(".venv/bin/")]
+    for command in found:
+        try:
+            understood(shlex.split(command)[1:], monkeypatch)
+        except SystemExit as ending:
+            assert ending.code == 0, capsys.readouterr()
+
+
+def test_command_lines_are_found() -> None:
+    assert len(LINES) > 40
+    assert {line.split()[0] for line in LINES} == {"make", "twirl", ".venv/bin/twirl"}
+
+
+PYTHON = [(page, text) for page in PAGES for text in blocks(page, "python")]
+
+
+@pytest.mark.parametrize(
+    ("page", "text"), PYTHON, ids=[f"{p.name}-{i}" for i, (p, _) in enumerate(PYTHON)]
+)
+def test_python_of_the_pages_names_what_exists(page: Path, text: str) -> None:
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("twirl_mjx"):
+            module = importlib.import_module(node.module or "")
+            for alias in node.names:
+                if not hasattr(module, alias.name):
+                    importlib.import_module(f"{node.module}.{alias.name}")
+        match node:
+            case ast.Attribute(value=ast.Name(id="twirl_mjx"), attr=name):
+                assert hasattr(twirl_mjx, name), (page, name)
+
+
+def test_a_wrong_option_is_not_understood(monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(SystemExit) as ending:
+        understood(["rehearse", "policy.npz", "--episods", "2"], monkeypatch)
+    assert ending.value.code == 2
+
+
+SHORTER = {
+    "num_envs=256": "num_envs=2",
+    "num_envs=64": "num_envs=2",
+    '"runs/biped-twirl-cpu-s0"': "POLICY",
+}
+"""Parts of the pages' Python that would take long, or need a run, and what stands for them."""
+GIVEN = """
+import jax, numpy as np, twirl_mjx
+from twirl_mjx.assets import asset_path
+from twirl_mjx.deploy.conditions import IDEAL
+from twirl_mjx.deploy.ground import build_model
+POLICY = str(asset_path("policies", "biped.npz"))
+action, obs = np.zeros((2, 12), np.float32), np.zeros(101, np.float32)
+model = build_model(IDEAL, np.zeros(0))
+qpos = np.repeat(model.key("home").qpos[None], 3, axis=0)
+"""
+"""What the pages speak of before: actions, an observation, a trajectory."""
+RUN = (("README.md", 0), ("adapters.md", 0), ("shifts.md", 1), ("view.md", 0))
+"""Page and block. The others show a form (a task, a sink), or need packages and results of
+one's own."""
+
+
+def run_python(text: str, folder: Path) -> None:
+    for long, short in SHORTER.items():
+        text = text.replace(long, short)
+    done = subprocess.run(
+        [sys.executable, "-c", GIVEN + text],
+        cwd=folder, env=os.environ | {"PYTHONPATH": str(ROOT)}, timeout=280,
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert "Warning" not in done.stderr and "Failed" not in done.stderr, done.stderr
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "place"), RUN)
+def test_python_of_the_pages_runs(name: str, place: int, tmp_path: Path) -> None:
+    page = next(page for page in PAGES if page.name == name)
+    run_python(list(blocks(page, "python"))[place], tmp_path)
+
+
+NOTEBOOK = ROOT / "examples" / "first_steps.ipynb"
+
+
+def cells() -> list[dict[str, Any]]:
+    found = json.loads(NOTEBOOK.read_text(encoding="utf-8"))["cells"]
+    return [cell for cell in found if cell["cell_type"] == "code"]
+
+
+def test_the_notebook_was_executed_and_is_small() -> None:
+    assert NOTEBOOK.stat().st_size < 300_000
+    counts = [cell["execution_count"] for cell in cells()]
+    assert counts == list(range(1, len(counts) + 1))
+    outputs = [output for cell in cells() for output in cell["outputs"]]
+    assert not [o for o in outputs if o["output_type"] == "error" or o.get("name") == "stderr"]
+    kinds = {kind for output in outputs for kind in output.get("data", {})}
+    assert {"image/png", "text/html"} <= kinds  # the curves and the film
+    assert "/root" not in NOTEBOOK.read_text() and "/tmp" not in NOTEBOOK.read_text()
+
+
+@pytest.mark.slow
+def test_the_notebook_runs(tmp_path: Path) -> None:
+    """Its code as it stands, but for a training of seconds; the film goes nowhere."""
+    text = "\n".join("".join(cell["source"]) for cell in cells())
+    shown = "import sys, types; sys.modules['IPython.display'] = types.SimpleNamespace(Video=print)"
+    settings = re.compile(r'    preset="cpu",.*?    say=', re.S)
+    short = settings.sub('    preset="debug",\n    say=', text)
+    assert "total_env_steps" in text and "total_env_steps" not in short
+    run_python(f"{shown}\n{short.replace('plt.show()', '')}", tmp_path)
+    for name in ("first-steps-film.mp4", "first-steps.html", "first-steps/policy.npz"):
+        assert (tmp_path / "runs" / name).is_file()

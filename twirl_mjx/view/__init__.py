@@ -1,0 +1,1 @@
+"""Moving pictures in a browser: a live page of a loop that people may touch, and replays."""
