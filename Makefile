@@ -12,7 +12,7 @@ CASE = $(if $(TASK),--task $(TASK)) $(if $(SHIFT),--shift $(SHIFT)) $(if $(SEED)
 
 help: ## show this table
 	@echo 'usage: make TARGET [TASK=..] [SHIFT=..] [SEED=..] [RUN=..] [GRID=..] [ARGS=".."]'
-	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  %-12s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  %-16s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
 	@echo 'ARGS is handed on as it is: make train TASK=biped ARGS="--preset debug"'
 	@echo 'All options of a command: .venv/bin/twirl COMMAND --help'
 
