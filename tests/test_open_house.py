@@ -19,7 +19,10 @@ import pytest
 
 import twirl_mjx
 from twirl_mjx import cli, plugins
+from twirl_mjx.commands.options import parse_train
 from twirl_mjx.sim.dynamics import SHIFTS
+from twirl_mjx.sweep import plan
+from twirl_mjx.sweep.grid import load
 from twirl_mjx.tasks.registry import TASKS
 from twirl_mjx.tasks.task import Measure, Task
 from twirl_mjx.training.presets import make_config
@@ -280,6 +283,23 @@ def test_a_source_object_from_python(tmp_path: Path) -> None:
         name="mine", total_env_steps=64, say=lambda _: None,
     )  # fmt: skip
     assert again.measures == result.measures
+
+
+def test_a_cell_names_the_files_of_its_task_and_its_shift(trot: str, tmp_path: Path) -> None:
+    """It is trained by another process, which has loaded neither."""
+    muddy = f"{ROOT / 'examples' / 'muddy.py'}:MUDDY"
+    grid = {
+        "preset": "debug",
+        "base": {"variant": "scratch", "trot.speed": 0.5},
+        "axes": {"task": {"trot": {"task": trot}}, "shift": {"mud": {"shift": muddy}}},
+        "seeds": (3,),
+    }
+    (tmp_path / "mine.py").write_text(f"GRID = ({grid!r},)\n")
+    (cell,) = plan.make_plan(load(str(tmp_path / "mine.py")), tmp_path)
+    argv = plan.arguments(cell, tmp_path)
+    assert argv[argv.index("--task") + 1] == trot
+    assert argv[argv.index("--shift") + 1] == muddy
+    assert parse_train(argv[1:]).config == cell.config
 
 
 def test_names_of_tasks_and_of_the_robot_stand_in_few_files() -> None:

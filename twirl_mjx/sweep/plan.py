@@ -15,9 +15,13 @@ from pathlib import Path
 from typing import Literal
 
 from twirl_mjx import files, plugins
+from twirl_mjx.sim.dynamics import SHIFTS
+from twirl_mjx.sim.robots import ROBOTS
 from twirl_mjx.sweep.grid import Draft, Grid, configure
+from twirl_mjx.tasks.registry import TASKS
 from twirl_mjx.training import config_json, rundir, source_rules
 from twirl_mjx.training.config import TrainConfig
+from twirl_mjx.training.learners import LEARNERS
 from twirl_mjx.training.presets import make_config
 from twirl_mjx.training.rundir import RunDir
 
@@ -247,16 +251,24 @@ def status_of(cell: Cell, runs: Path) -> Status:
 
 
 def arguments(cell: Cell, runs: Path) -> list[str]:
-    """Return the arguments of ``twirl`` that train (or resume) a cell."""
-    plain = config_json.flatten(make_config(cell.config.task, cell.preset))
+    """Return the arguments of ``twirl`` that train (or resume) a cell, in a process of its own.
+
+    What came from a user's file is named by it: the other process has not loaded that.
+    """
+    registries = {"task": TASKS, "learner": LEARNERS, "shift": SHIFTS, "robot": ROBOTS}
+    plain = config_json.flatten(make_config(cell.config.task, cell.preset, cell.config.learner)) | {
+        "task": None,
+        "learner": TrainConfig.learner,
+    }
     wanted = config_json.flatten(
         dataclasses.replace(cell.config, source=cell.source, source_contract=cell.contract)
     )
-    argv = ["train", "--preset", cell.preset, "--task", cell.config.task]
-    argv += ["--name", cell.name, "--runs", str(runs)]
+    argv = ["train", "--preset", cell.preset, "--name", cell.name, "--runs", str(runs)]
     for field, value in wanted.items():
-        if value == plain[field] or field == "task":
+        if value == plain[field] or field == "uses":
             continue
+        if field in registries:
+            value = registries[field].reference(value) or value
         flag = field.replace("_", "-")
         if isinstance(value, bool):
             *parents, leaf = flag.split(".")
