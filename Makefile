@@ -6,8 +6,9 @@ TWIRL := .venv/bin/twirl
 PYTEST := .venv/bin/pytest
 CASE = $(if $(TASK),--task $(TASK)) $(if $(SHIFT),--shift $(SHIFT)) $(if $(SEED),--seed $(SEED))
 
-.PHONY: help setup bench-setup lint format test test-slow train evaluate collect sweep figures \
-	report render view demo bench curriculum docs dist clean
+.PHONY: help setup bench-setup gpu-setup test-gpu test-jax-oldest gpu-counts gpu-proof lint \
+	format test test-slow train evaluate collect sweep figures report render view demo bench \
+	curriculum docs dist clean
 
 help: ## show this table
 	@echo 'usage: make TARGET [TASK=..] [SHIFT=..] [SEED=..] [RUN=..] [GRID=..] [ARGS=".."]'
@@ -20,6 +21,9 @@ setup: ## make or refresh .venv (PYTHON=/path/to/python3.12, ACCEL=cpu|cuda12|cu
 
 bench-setup: setup ## make or refresh .venv-bench, the environment of the SBX comparison
 	@.ci/setup bench
+
+gpu-setup: ## make or refresh .venv-gpu, jax for CUDA, with or without a GPU (WHEELS=folder: no network)
+	@.ci/setup gpu
 
 lint: setup ## ruff check, ruff format --check, pyright
 	.venv/bin/ruff check .
@@ -35,6 +39,19 @@ test: setup ## the default tests, on the CPU, a worker per core (ARGS="tests/dro
 
 test-slow: setup ## the learning curves and other long tests
 	$(PYTEST) -m "slow and not gpu" $(ARGS)
+
+test-gpu: gpu-setup ## the tests that need a GPU
+	JAX_PLATFORMS=cuda,cpu TWIRL_TEST_PLATFORMS=cuda,cpu .venv-gpu/bin/pytest -m gpu $(ARGS)
+
+test-jax-oldest: ## a part of the tests with the oldest jax that is allowed
+	@.ci/setup oldest
+	.venv-oldest/bin/pytest $(if $(ARGS),$(ARGS),tests/droq tests/replay tests/sim tests/tasks/test_vector.py tests/training)
+
+gpu-counts: gpu-setup ## count GPU operations per update, without a GPU
+	JAX_PLATFORMS=cpu .venv-gpu/bin/twirl bench gpu-compile $(ARGS)
+
+gpu-proof: ## parity, timings and a real training on a GPU (MINUTES=9 WHEELS=folder: no network)
+	@MINUTES=$(or $(MINUTES),9) WHEELS=$(WHEELS) .ci/gpu-proof $(ARGS)
 
 train: setup ## train TASK= under SHIFT= with SEED= (ARGS="--preset debug --variant scratch")
 	$(TWIRL) train $(CASE) $(ARGS)

@@ -90,10 +90,11 @@ def test_numbers_out_of_range_are_refused(changes: dict[str, Any], message: str)
 
 
 def test_options_reach_the_learner() -> None:
-    config = LearnerBench(plain=True, matmul_dtype="bfloat16", batch=64, utd=5, hidden=32).droq
+    config = LearnerBench(form="plain", matmul_dtype="bfloat16", batch=64, utd=5, hidden=32).droq
     assert (config.fast, config.matmul_dtype) == (False, "bfloat16")
     assert (config.batch_size, config.updates_per_block, config.hidden_sizes) == (64, 5, (32, 32))
     assert LearnerBench().droq.fast
+    assert LearnerBench(form="accelerator").droq.form == "accelerator"
 
 
 def test_replay_is_full_of_usable_rows() -> None:
@@ -164,8 +165,8 @@ def test_workers_may_be_switched_off() -> None:
 def test_worker_that_dies_is_reported() -> None:
     options = dataclasses.asdict(LearnerBench()) | {"batch": 0}
     with (
-        worker.Worker(0, options) as broken,
-        pytest.raises(RuntimeError, match="pinned learner ended with status 1"),
+        worker.Worker("learner", options, cpu=0) as broken,
+        pytest.raises(RuntimeError, match="measuring process ended with status 1"),
     ):
         broken.wait_until_ready()
 

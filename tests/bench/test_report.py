@@ -95,6 +95,7 @@ EPOCH: dict[str, Any] = {
     "seconds": {"physics": 0.5, "critic": 1.25},
     "shares": {"physics": 0.25, "critic": 0.625},
     "unaccounted_s": 0.25,
+    "spread": 0.1,
     "peak_memory_mb": 1234.5,
     "machine": MACHINE,
 }
@@ -287,10 +288,33 @@ def test_everything_is_written(
     assert "SBX DroQ" in first
     assert json.loads(out.read_text())["parts"] == PARTS
     assert "SBX DroQ" in capsys.readouterr().out
-    given["epoch"] = {"part": "epoch", "error": "stopped"}
-    assert cli.main(words) == 1
-    assert "stopped" in page.read_text()
-    assert page.read_text().count(report.BEGIN) == 1
+    for changed, why in (
+        ({"part": "epoch", "error": "stopped"}, "epoch: stopped"),
+        (EPOCH | {"spread": 0.21}, "epoch: samples spread by 21 %"),
+    ):
+        given["epoch"] = changed
+        assert cli.main(words) == 1
+        assert page.read_text() == first
+        assert f"stay as they were: {why}" in " ".join(capsys.readouterr().out.split())
+        assert json.loads(out.read_text())["parts"]["epoch"] == changed
+
+
+def test_noise_and_contradictions_are_doubts() -> None:
+    assert report.doubts(PARTS) == []
+    noisy = {"single": {"spread": 0.3}, "sbx": {"spread": 0.2}}
+    row = WORLDS["rows"][0] | {"control_steps_spread": 0.5}
+    assert report.doubts(
+        {
+            "learner": LEARNER | {"detail": noisy, "share_of_matmul_bound": 1.52},
+            "worlds": WORLDS | {"rows": [row]},
+            "epoch": EPOCH | {"unaccounted_s": -1.3},
+        }
+    ) == [
+        "learner: 152 % of a bound that nothing can be above",
+        "epoch: its parts leave -65 % of it unaccounted",
+        "learner, single: samples spread by 30 %",
+        "worlds, native with 1024: samples spread by 50 %",
+    ]
 
 
 def test_page_is_checked_before_anything_is_measured(

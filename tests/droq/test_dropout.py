@@ -60,6 +60,14 @@ def test_masks_of_critics_layers_steps_and_networks_are_independent():
     assert np.abs(correlation).max() < bound
 
 
+@pytest.mark.parametrize("shape", [(1, 4, 6), (2, 3, 5), (3, 8, 7)])
+def test_elements_by_themselves_have_the_same_mask(shape):
+    seed = SEEDS[1, 1]
+    expected = dropout.keep_mask(seed, shape, 0.25)
+    assert 0 < int(expected.sum()) < expected.size
+    np.testing.assert_array_equal(dropout.keep_mask_by_element(seed, shape, 0.25), expected)
+
+
 @pytest.mark.parametrize(("rate", "dropped"), [(0.01, 655), (0.25, 16384), (0.0, 0)])
 def test_drop_probability_is_the_stated_one(rate, dropped):
     assert dropout.threshold(rate) == dropped

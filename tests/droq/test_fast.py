@@ -1,4 +1,4 @@
-"""The fast update is the plain one: same masks and noise in, same parameters out."""
+"""The fast forms are the plain one: same masks and noise in, same parameters out."""
 
 from __future__ import annotations
 
@@ -9,20 +9,25 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from twirl_mjx.droq import dropout, fast, fused, learner, packing, plain
+from twirl_mjx.droq import accelerator, dropout, fast, forms, fused, learner, packing, plain
 from twirl_mjx.droq.config import DroqConfig
 from twirl_mjx.droq.state import CriticState
 
 OBS_SIZE, ACTION_SIZE, U = 5, 2, 4
 
-# Both forms do the same float32 arithmetic in another order; Adam divides small gradients by
+# All forms do the same float32 arithmetic in another order; Adam divides small gradients by
 # their own size, so the relative error of a parameter is set by its step (1e-2), not its value.
 TOLERANCE = {"rtol": 1e-4, "atol": 2e-5}
 
 
-def plain_masks(masks):
-    """Turn masks [E, H, B] of the fast form into [E, B, H]."""
-    return [jnp.swapaxes(mask, 1, 2) for mask in masks]
+FAST_FORMS = pytest.mark.parametrize("form", [fast, accelerator], ids=["fast", "accelerator"])
+
+plain_step = jax.jit(plain.critic_step, static_argnums=3)
+
+
+def plain_masks(form, masks):
+    """Turn masks of a fast form, [E, H, B] in that for CPUs, into [E, B, H]."""
+    return [jnp.swapaxes(mask, 1, 2) if form is fast else mask for mask in masks]
 
 
 def assert_trees_close(actual, expected, **tolerance):
@@ -39,11 +44,12 @@ def critic_state(state):
     return CriticState(state.critic, state.target_critic, state.critic_opt)
 
 
+@FAST_FORMS
 @pytest.mark.parametrize(
     ("hidden_sizes", "num_critics"), [((32, 16), 2), ((24,), 1), ((16, 20, 8), 3)]
 )
 def test_block_equals_explicit_plain_steps_with_the_same_masks(
-    small_config, transitions, hidden_sizes, num_critics
+    small_config, transitions, hidden_sizes, num_critics, form
 ):
     config = dataclasses.replace(small_config, hidden_sizes=hidden_sizes, num_critics=num_critics)
     keys = jax.random.split(jax.random.key(0), 4)
@@ -51,25 +57,20 @@ def test_block_equals_explicit_plain_steps_with_the_same_masks(
     batch = transitions(keys[1], U, config.batch_size)
     noise = jax.random.normal(keys[2], (U, config.batch_size, ACTION_SIZE))
     temperature = jnp.float32(0.3)
-    block = jax.jit(fast.critic_block, static_argnums=3)
+    block = jax.jit(form.critic_block, static_argnums=3)
     actual, metrics = block(
         critic_state(state), state.actor, temperature, config, batch, noise, keys[3]
     )
 
     seeds = dropout.seeds(keys[3], (U, 2, len(hidden_sizes)))
-    step = jax.jit(plain.critic_step, static_argnums=3)
     expected, history = critic_state(state), []
     for i in range(U):
         masks = [
-            plain_masks(
-                fused.ensemble_masks(
-                    seeds[i, j], num_critics, hidden_sizes, config.batch_size, config.dropout_rate
-                )
-            )
+            plain_masks(form, form.LAYOUT.masks(seeds[i, j], config.batch_size, config))
             for j in range(2)
         ]
         minibatch = jax.tree.map(lambda x, i=i: x[i], batch)
-        expected, step_metrics = step(
+        expected, step_metrics = plain_step(
             expected, state.actor, temperature, config, minibatch, noise[i], keys[3], tuple(masks)
         )
         history.append(step_metrics)
@@ -83,22 +84,21 @@ def test_block_equals_explicit_plain_steps_with_the_same_masks(
     assert min(jax.tree.leaves(change)) > 1e-3
 
 
-def test_action_gradient_of_q_equals_the_plain_one(small_config, transitions):
+@FAST_FORMS
+def test_action_gradient_of_q_equals_the_plain_one(small_config, transitions, form):
     keys = jax.random.split(jax.random.key(1), 3)
     state = learner.init(keys[0], small_config, OBS_SIZE, ACTION_SIZE)
     batch = transitions(keys[1], small_config.batch_size)
     seeds = dropout.seeds(keys[2], (2,))
-    masks = fused.ensemble_masks(
-        seeds, 2, small_config.hidden_sizes, small_config.batch_size, small_config.dropout_rate
-    )
+    masks = form.LAYOUT.masks(seeds, small_config.batch_size, small_config)
 
     def total(form, action, keep):
         q = form.critic_q(state.critic, batch.obs, action, small_config, keys[2], keep)
         return jnp.sum(jnp.sin(q)), q
 
     gradient = jax.value_and_grad(total, argnums=1, has_aux=True)
-    (_, fast_q), fast_grad = gradient(fast, batch.action, masks)
-    (_, plain_q), plain_grad = gradient(plain, batch.action, plain_masks(masks))
+    (_, fast_q), fast_grad = gradient(form, batch.action, masks)
+    (_, plain_q), plain_grad = gradient(plain, batch.action, plain_masks(form, masks))
     np.testing.assert_allclose(fast_q, plain_q, rtol=1e-5, atol=1e-5)
     np.testing.assert_allclose(fast_grad, plain_grad, rtol=1e-4, atol=1e-5)
     assert float(jnp.abs(plain_grad).min()) > 0
@@ -133,15 +133,29 @@ def test_transpose_in_blocks_is_a_transpose():
         np.testing.assert_array_equal(fused.transpose(kernel), kernel.transpose(0, 2, 1))
 
 
-def test_unpack_undoes_pack(small_config):
+@FAST_FORMS
+def test_unpack_undoes_pack(small_config, form):
     for hidden_sizes in ((32, 16), (8,), (16, 8, 4)):
         config = dataclasses.replace(small_config, hidden_sizes=hidden_sizes, num_critics=3)
         state = learner.init(jax.random.key(0), config, OBS_SIZE, ACTION_SIZE)
         noisy = jax.tree.map(
             lambda x: x + jax.random.normal(jax.random.key(x.size), x.shape), state.critic
         )
-        packed = packing.pack(noisy, hidden_sizes)
+        packed = form.LAYOUT.restore(form.LAYOUT.arrange(packing.pack(noisy, hidden_sizes)))
         assert_trees_close(packing.unpack(packed, hidden_sizes), noisy, rtol=0, atol=0)
+
+
+def test_the_backend_chooses_the_form(monkeypatch):
+    assert [forms.name_of(DroqConfig(form=f)) for f in ("auto", "fast", "accelerator")] == [
+        "fast", "fast", "accelerator",
+    ]  # fmt: skip
+    assert forms.name_of(DroqConfig(fast=False, form="accelerator")) == "plain"
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    assert forms.form_of(DroqConfig()) is accelerator
+    assert forms.form_of(DroqConfig(form="fast")) is fast
+    assert forms.form_of(DroqConfig(fast=False)) is plain
+    with pytest.raises(ValueError, match=r"droq.form.*'gpu'.*accelerator"):
+        DroqConfig(form="gpu")
 
 
 def test_bfloat16_products_stay_close_and_parameters_stay_float32(transitions):

@@ -10,7 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from twirl_mjx.droq import fast, learner, losses, networks, plain
+from twirl_mjx.droq import learner, losses, networks
+from twirl_mjx.droq.forms import FORMS, settings_of
 from twirl_mjx.droq.state import CriticState
 
 OBS_SIZE, ACTION_SIZE, U = 5, 2, 4
@@ -28,8 +29,11 @@ METRICS = {
 
 # One jitted function per form, shared by the tests, so that equal shapes compile once.
 update = jax.jit(learner.update, static_argnums=1)
-FORMS = {"fast": fast, "plain": plain}
 blocks = {name: jax.jit(form.critic_block, static_argnums=3) for name, form in FORMS.items()}
+
+
+def in_form(config, form):
+    return dataclasses.replace(config, **settings_of(form))
 
 
 @pytest.fixture
@@ -47,12 +51,12 @@ def largest_change(new, old):
     return jax.tree.map(lambda a, b: float(jnp.abs(a - b).max()), new, old)
 
 
-@pytest.mark.parametrize("form", ["fast", "plain"])
+@pytest.mark.parametrize("form", FORMS)
 def test_update_is_u_critic_steps_then_one_actor_and_temperature_step(
     state, small_config, transitions, form
 ):
     """The scan over U equals U calls, and the actor sees the last minibatch and the new critics."""
-    config = dataclasses.replace(small_config, fast=form == "fast")
+    config = in_form(small_config, form)
     module = FORMS[form]
     batch = transitions(jax.random.key(1), U, config.batch_size)
     key = jax.random.key(2)
@@ -93,9 +97,9 @@ def test_update_is_u_critic_steps_then_one_actor_and_temperature_step(
     np.testing.assert_allclose(metrics["temperature_loss"], surplus, rtol=1e-4)
 
 
-@pytest.mark.parametrize("is_fast", [True, False])
-def test_counters_types_and_metrics(state, small_config, transitions, count_traces, is_fast):
-    config = dataclasses.replace(small_config, fast=is_fast)
+@pytest.mark.parametrize("form", FORMS)
+def test_counters_types_and_metrics(state, small_config, transitions, count_traces, form):
+    config = in_form(small_config, form)
     counter = count_traces(learner.update)
     step = jax.jit(counter, static_argnums=1)
     new, current = None, state
@@ -115,7 +119,7 @@ def test_counters_types_and_metrics(state, small_config, transitions, count_trac
     assert min(jax.tree.leaves(largest_change(new.actor, state.actor))) > 0
 
 
-@pytest.mark.parametrize("form", ["fast", "plain"])
+@pytest.mark.parametrize("form", FORMS)
 def test_target_moves_by_tau_after_the_critic(state, one_step_config, transitions, form):
     config = one_step_config
     old = CriticState(state.critic, jax.tree.map(lambda x: x + 1.0, state.critic), state.critic_opt)
@@ -132,7 +136,7 @@ def test_target_moves_by_tau_after_the_critic(state, one_step_config, transition
     assert min(jax.tree.leaves(largest_change(new.critic, old.critic))) > 0
 
 
-@pytest.mark.parametrize("module", [fast, plain])
+@pytest.mark.parametrize("module", FORMS.values(), ids=FORMS)
 def test_dropout_tells_keys_and_critics_apart(state, small_config, transitions, module):
     batch = transitions(jax.random.key(1), small_config.batch_size)
     twins = jax.tree.map(lambda x: jnp.stack([x[0], x[0]]), state.critic)
@@ -148,7 +152,7 @@ def test_dropout_tells_keys_and_critics_apart(state, small_config, transitions, 
     np.testing.assert_allclose(calm[0], calm[1], rtol=1e-6)
 
 
-@pytest.mark.parametrize("form", ["fast", "plain"])
+@pytest.mark.parametrize("form", FORMS)
 def test_dropout_is_active_in_online_target_and_actor_losses(
     state, one_step_config, transitions, form
 ):
@@ -164,7 +168,7 @@ def test_dropout_is_active_in_online_target_and_actor_losses(
     ]
     for name in ("target_q_mean", "q_mean"):
         assert abs(float(results[0][1][name] - results[1][1][name])) > 1e-4, name
-    actor_config = dataclasses.replace(config, fast=form == "fast")
+    actor_config = in_form(config, form)
     step = jax.jit(
         lambda key: learner.actor_step(state, actor_config, batch.obs[0], batch.action[0], key)[1][
             "actor_loss"

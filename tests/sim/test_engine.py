@@ -6,6 +6,7 @@ MJX takes half a minute to compile, so one compiled function of three worlds ser
 from __future__ import annotations
 
 from collections.abc import Callable
+from types import SimpleNamespace
 from typing import Any
 
 import jax
@@ -31,7 +32,7 @@ def flat() -> Scene:
 
 def make_step(built: Scene, name: engine.EngineName, threads: int = 1) -> Step:
     """Return ``step(qpos, qvel, command, dynamics)`` -> traces [N, S, 19], [N, S, 18]."""
-    physics = engine.make_engine(name, built, threads)
+    physics = engine.make_engine(name, built, 1, threads)
 
     @jax.jit
     def run(
@@ -237,7 +238,7 @@ def test_native_threads_and_vmap_change_nothing(flat: Scene, native_step: Step) 
     args = make_command(target), make_worlds()
     expected = native_step(qpos, qvel, *args)
     threaded = make_step(flat, "native", threads=2)(qpos, qvel, *args)
-    physics = engine.make_engine("native", flat, 1)
+    physics = engine.make_engine("native", flat, 1, threads=1)
     data = engine.make_data(flat, N).replace(
         qpos=jnp.asarray(qpos, jnp.float32), qvel=jnp.asarray(qvel, jnp.float32)
     )
@@ -297,13 +298,35 @@ def test_robot_stands_on_bumps_of_any_strength() -> None:
 
 def test_unknown_engine_is_refused(flat: Scene) -> None:
     with pytest.raises(ValueError, match="unknown engine 'warp': choose auto, mjx or native"):
-        engine.make_engine("warp", flat)  # type: ignore[arg-type]
+        engine.make_engine("warp", flat, 1)  # type: ignore[arg-type]
 
 
 def test_auto_is_native_on_a_cpu(flat: Scene) -> None:
     assert jax.default_backend() == "cpu"
-    assert isinstance(engine.make_engine("auto", flat), engine.NativeEngine)
-    assert isinstance(engine.make_engine("mjx", flat), engine.MjxEngine)
+    for worlds in (1, 100_000):
+        assert isinstance(engine.make_engine("auto", flat, worlds), engine.NativeEngine)
+    assert isinstance(engine.make_engine("mjx", flat, 1), engine.MjxEngine)
+
+
+def test_auto_on_an_accelerator_is_native_for_few_worlds(
+    flat: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    assert isinstance(engine.make_engine("auto", flat, 1023), engine.NativeEngine)
+    assert isinstance(engine.make_engine("auto", flat, 1024), engine.MjxEngine)
+    assert isinstance(engine.make_engine("native", flat, 1024), engine.NativeEngine)
+
+
+def test_native_needs_the_host_beside_an_accelerator(
+    flat: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = SimpleNamespace(jax_platforms="cuda")
+    monkeypatch.setattr(engine, "jax", SimpleNamespace(config=config))
+    with pytest.raises(ValueError, match=r"JAX_PLATFORMS=cuda hides.*JAX_PLATFORMS=cuda,cpu"):
+        engine.make_engine("native", flat, 1)
+    assert isinstance(engine.make_engine("mjx", flat, 1), engine.MjxEngine)
+    config.jax_platforms = "cuda,cpu"
+    assert isinstance(engine.make_engine("native", flat, 1), engine.NativeEngine)
 
 
 @pytest.mark.slow

@@ -118,7 +118,7 @@ def test_the_centre_of_mass_moves_where_frames_coincide(flat: Scene) -> None:
 
 def make_late_step(built: Scene, name: engine.EngineName) -> Step:
     """Return ``step(qpos, qvel, target, previous, dynamics)`` -> the traces, motors whole."""
-    physics = engine.make_engine(name, built, 1)
+    physics = engine.make_engine(name, built, 1, threads=1)
 
     @jax.jit
     def step(

@@ -58,7 +58,7 @@ class EpochBench:
     task: str = DEFAULT_TASK
     """Task."""
     preset: str = "cpu"
-    """Sizes: paper, cpu or debug."""
+    """Sizes: paper, cpu, massive or debug."""
 
     def __post_init__(self) -> None:
         """Check names and numbers.
@@ -229,7 +229,7 @@ def measure(options: EpochBench) -> Record:
         "part": "epoch",
         "task": options.task,
         "preset": options.preset,
-        "engine": resolve_engine(config.engine),
+        "engine": resolve_engine(config.engine, config.num_envs),
         "num_envs": config.num_envs,
         "env_steps": config.steps_per_epoch * env.num_envs,
         "critic_updates": config.steps_per_epoch * config.updates_per_step,

@@ -41,7 +41,7 @@ class FormsBench:
     task: str = DEFAULT_TASK
     """Task, trained from scratch."""
     preset: str = "cpu"
-    """Sizes: paper, cpu or debug."""
+    """Sizes: paper, cpu, massive or debug."""
     seeds: int = 3
     """Seeds, one program."""
     env_steps: int = 48_000

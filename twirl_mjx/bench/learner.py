@@ -27,7 +27,8 @@ from twirl_mjx.bench.measure import (
     summary,
 )
 from twirl_mjx.bench.worker import Worker, pinning_missing
-from twirl_mjx.checks import check_range
+from twirl_mjx.checks import check_choice, check_range
+from twirl_mjx.droq import forms
 from twirl_mjx.droq import learner as droq
 from twirl_mjx.droq.config import DroqConfig
 from twirl_mjx.machine import usable_cores
@@ -63,8 +64,9 @@ class LearnerBench:
     """Learners in one program (a vmap axis); as many as CPUs by default, at least 2."""
     workers: int | None = None
     """Learners in processes pinned to one CPU each; as many as CPUs by default, 0 for none."""
-    plain: bool = False
-    """Measure the plain flax/optax form instead of the fast one."""
+    form: Literal["auto", "plain", "fast", "accelerator"] = "auto"
+    """Form of the update: the plain flax/optax one, fast (CPUs), accelerator (GPUs and TPUs);
+    auto is the one of the machine."""
     matmul_dtype: Literal["float32", "bfloat16"] = "float32"
     """Precision of matrix products (SBX always uses float32)."""
     sbx: bool = True
@@ -79,6 +81,7 @@ class LearnerBench:
         check_range("seconds", self.seconds, 0.1, 3600.0)
         for name in ("rounds", "obs", "action", "batch", "utd", "hidden"):
             check_range(name, getattr(self, name), 1, 1_000_000)
+        check_choice("form", self.form, ("auto", *forms.FORMS))
         check_range("seeds", self.num_seeds, 1, 1000)
         check_range("workers", self.num_workers, 0, len(usable_cores()))
 
@@ -100,33 +103,30 @@ class LearnerBench:
             batch_size=self.batch,
             utd=float(self.utd),
             updates_per_block=self.utd,
-            fast=not self.plain,
             matmul_dtype=self.matmul_dtype,
+            **forms.settings_of(self.form),
         )
 
 
 def random_ring(options: LearnerBench, seeds: int) -> ring.RingBuffer:
     """Return full replays of random rows, of the ranges that the SBX peer uses too.
 
-    Drawn by numpy, which compiles nothing. With more than one seed, leaves are [S, ...].
+    Drawn by numpy, which compiles nothing. With more than one seed, leaves are [S, ...] and all
+    seeds have the same rows: drawing those of 128 on the host would take 5.5 GB of it.
     """
     rng = np.random.default_rng(0)
-    lead = (ROWS,) if seeds == 1 else (seeds, ROWS)
 
     def normal() -> np.ndarray:
-        return rng.standard_normal((*lead, options.obs), np.float32)
+        return rng.standard_normal((ROWS, options.obs), np.float32)
 
-    ends = rng.uniform(size=(*lead, 1)) < 0.01
-    reward = rng.uniform(0, 2, (*lead, 1))
-    action = rng.uniform(-1, 1, (*lead, options.action))
+    ends = rng.uniform(size=(ROWS, 1)) < 0.01
+    reward = rng.uniform(0, 2, (ROWS, 1))
+    action = rng.uniform(-1, 1, (ROWS, options.action))
     rows = np.concatenate([normal(), action, reward, ends, normal()], axis=-1, dtype=np.float32)
-    return ring.RingBuffer(
-        rows=jnp.asarray(rows),
-        insert_index=jnp.asarray(np.zeros(lead[:-1], np.int32)),
-        size=jnp.asarray(np.full(lead[:-1], ROWS, np.int32)),
-        obs_size=options.obs,
-        action_size=options.action,
-    )
+    one = ring.from_rows(jnp.asarray(rows), options.obs, options.action)
+    if seeds == 1:
+        return one
+    return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (seeds, *leaf.shape)), one)
 
 
 def make_learner(options: LearnerBench, seeds: int) -> tuple[Chain, int]:
@@ -253,7 +253,8 @@ def measure(options: LearnerBench) -> Record:
         if reasons["workers"] is None:
             cpus = usable_cores()[: options.num_workers]
             alone = dataclasses.replace(options, workers=0)  # a worker sees one CPU only
-            workers = [stack.enter_context(Worker(cpu, dataclasses.asdict(alone))) for cpu in cpus]
+            given = dataclasses.asdict(alone)
+            workers = [stack.enter_context(Worker("learner", given, cpu=cpu)) for cpu in cpus]
         for worker in workers:
             worker.wait_until_ready()
         for number in range(options.rounds):
@@ -310,7 +311,7 @@ def _record(
         "aggregate_ratio_to_sbx": None if sbx is None else together[best] / sbx,
         "compile_s": compile_s,
         "seeds_compile_s": seeds_compile_s,
-        "form": "plain" if options.plain else "fast",
+        "form": forms.name_of(options.droq),
         "detail": detail,
         **{name: getattr(options, name) for name in ("obs", "action", "batch", "utd", "hidden")},
         "matmul_dtype": options.matmul_dtype,

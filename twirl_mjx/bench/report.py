@@ -165,12 +165,90 @@ def forms_sheet(record: Record) -> Sheet:
     return Sheet("Forms of the learner", ("quarter", *forms), rows, note)
 
 
+def gpu_compile_sheet(record: Record) -> Sheet:
+    """Lay out operations per turn of the innermost loop, and of what surrounds it."""
+    rows = tuple(
+        (
+            row["program"],
+            row["form"] or "MJX",
+            str(row["seeds"]),
+            str(row["in_loop"]),
+            " > ".join(
+                f"{block['name']} {block['count']}"
+                for block in row["loops"]
+                if block["name"] != "condition"
+            ),
+            f"{row['temporary_mb']:.0f}",
+            f"{row['compile_s']:.0f}",
+        )
+        for row in record["rows"]
+    )
+    note = f"compiled for {record['card']} without one; epoch (no physics) and worlds"
+    note += f" ({record['num_envs']:,} of MJX): {record['task']}"
+    note += f"; XLA flags: {' '.join(record['flags'])}" if record["flags"] else ""
+    columns = ("program", "form", "seeds", "in the loop", "all", "temporary MB", "compile s")
+    return Sheet("GPU operations", columns, rows, note)
+
+
+def gpu_parity_sheet(record: Record) -> Sheet:
+    """Lay out the largest error of every part against the CPU."""
+    worst: dict[str, Record] = {}
+    for row in record["rows"]:
+        part = row["name"].rsplit(".", 1)[0]
+        if part not in worst or not row["error"] <= worst[part]["error"]:
+            worst[part] = row
+    rows = tuple(
+        (
+            part,
+            row["name"].rsplit(".", 1)[1],
+            f"{row['error']:.1e}",
+            f"{row['tolerance']:.0e}",
+            "yes" if row["error"] <= row["tolerance"] else "no",
+        )
+        for part, row in worst.items()
+    )
+    columns = ("part", "worst array", "relative error", "tolerance", "within")
+    return Sheet("Parity with the CPU", columns, rows)
+
+
+def gpu_timings_sheet(record: Record) -> Sheet:
+    """Lay out a row per variant, and why one was not measured."""
+    rows = tuple(
+        (row["name"], "-", row["unit"], "-", row["fault"])
+        if row["fault"]
+        else (row["name"], number(row["rate"]), row["unit"], percent(row["spread"]), "")
+        for row in record["rows"]
+    )
+    return Sheet("Timings", ("variant", "rate", "unit", "spread", "not measured because"), rows)
+
+
+def gpu_training_sheet(record: Record) -> Sheet:
+    """Lay out how far every seed came."""
+    rows = tuple(
+        (
+            str(row["seed"]),
+            f"{row['env_steps']:,}",
+            f"{row['grad_steps']:,}",
+            f"{row['wall_s']:.0f}",
+            number(row["updates_per_s"]),
+            number(row["eval_return"]),
+        )
+        for row in record["rows"]
+    )
+    columns = ("seed", "transitions", "critic updates", "s", "updates/s", "return")
+    return Sheet("Training", columns, rows)
+
+
 SHEETS: dict[str, Callable[[Record], Sheet]] = {
     "learner": learner_sheet,
     "worlds": worlds_sheet,
     "startup": startup_sheet,
     "epoch": epoch_sheet,
     "forms": forms_sheet,
+    "gpu-compile": gpu_compile_sheet,
+    "gpu-parity": gpu_parity_sheet,
+    "gpu-timings": gpu_timings_sheet,
+    "gpu-training": gpu_training_sheet,
 }
 
 
@@ -183,6 +261,33 @@ def sheets_of(parts: Mapping[str, Record]) -> list[Sheet]:
         else:
             found.append(SHEETS[name](record))
     return found
+
+
+NOISY = 0.2
+"""Spread, or share that does not add up, above which a result is not published."""
+
+
+def doubts(parts: Mapping[str, Record]) -> list[str]:
+    """Return a line for every reason not to publish results: faults, noise, contradictions."""
+    told = [f"{name}: {record['error']}" for name, record in parts.items() if "error" in record]
+    whole = {name: record for name, record in parts.items() if "error" not in record}
+    spreads: dict[str, float] = {}
+    if learner := whole.get("learner"):
+        spreads |= {f"learner, {name}": each["spread"] for name, each in learner["detail"].items()}
+        if learner["share_of_matmul_bound"] > 1.0:
+            share = percent(learner["share_of_matmul_bound"])
+            told.append(f"learner: {share} of a bound that nothing can be above")
+    if worlds := whole.get("worlds"):
+        for row in worlds["rows"]:
+            name = f"worlds, {row['engine']} with {row['num_envs']}"
+            spreads[name] = row["control_steps_spread"]
+    if epoch := whole.get("epoch"):
+        spreads["epoch"] = epoch["spread"]
+        left = epoch["unaccounted_s"] / epoch["epoch_s"]
+        if abs(left) > NOISY:
+            told.append(f"epoch: its parts leave {percent(left)} of it unaccounted")
+    noisy = {name: spread for name, spread in spreads.items() if spread > NOISY}
+    return told + [f"{name}: samples spread by {percent(spread)}" for name, spread in noisy.items()]
 
 
 def machine_line(machine: Mapping[str, Any]) -> str:

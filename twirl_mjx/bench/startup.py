@@ -34,7 +34,7 @@ class StartupBench:
     task: str = DEFAULT_TASK
     """Task, trained from scratch."""
     preset: str = "cpu"
-    """Sizes: paper, cpu or debug."""
+    """Sizes: paper, cpu, massive or debug."""
     repeats: int = 2
     """Starts with a filled cache."""
     seconds: float = 300.0

@@ -139,6 +139,24 @@ def bare_native(env: VectorEnv, data: mjx.Data, targets: jax.Array) -> Callable[
     return run
 
 
+def make_chain(task: str, engine: str, num_envs: int) -> tuple[Chain, int]:
+    """Compile random control steps of worlds.
+
+    Returns:
+        The chain, whose state is that of :func:`random_steps` with the last joint targets, and the
+        control steps of all worlds that one call takes.
+    """
+    env = make(task, num_envs=num_envs, engine=engine)
+    state = jax.jit(env.reset)(jax.random.key(0))
+
+    def run(carry: Any) -> Any:
+        return random_steps(env, carry[0])
+
+    targets = jnp.zeros((STEPS, num_envs, env.action_size))
+    chain = Chain(run, ((state, jax.random.key(1)), targets), donate=False)
+    return chain, STEPS * num_envs
+
+
 def measure_row(task: str, engine: str, num_envs: int, seconds: float) -> Record:
     """Measure one number of worlds on one engine.
 
@@ -150,13 +168,7 @@ def measure_row(task: str, engine: str, num_envs: int, seconds: float) -> Record
     """
     progress(f"bench worlds: {engine}, {num_envs} worlds")
     env = make(task, num_envs=num_envs, engine=engine)
-    state = jax.jit(env.reset)(jax.random.key(0))
-
-    def run(carry: Any) -> Any:
-        return random_steps(env, carry[0])
-
-    targets = jnp.zeros((STEPS, num_envs, env.action_size))
-    chain = Chain(run, ((state, jax.random.key(1)), targets), donate=False)
+    chain, work = make_chain(task, engine, num_envs)
     for _ in range(WARMUP_CALLS - 1):
         chain()
     before = chain.state[0][0].data
@@ -165,7 +177,7 @@ def measure_row(task: str, engine: str, num_envs: int, seconds: float) -> Record
     began = time.perf_counter()
     bare_call = (bare_mjx if engine == "mjx" else bare_native)(env, before, targets)
     bare_compile_s = time.perf_counter() - began
-    whole_samples, bare_samples = sample_in_turn([chain, bare_call], STEPS * num_envs, seconds)
+    whole_samples, bare_samples = sample_in_turn([chain, bare_call], work, seconds)
     rates, bare = summary(whole_samples), summary(bare_samples)
     ratios = [b / whole for whole, b in zip(whole_samples, bare_samples, strict=True)]
     substeps = env.scene.options.n_substeps
@@ -248,7 +260,7 @@ def measure(options: WorldsBench) -> Record:
 
 def headline(rows: list[Record], options: WorldsBench) -> Record:
     """Return the row to show first: the default engine at 128 worlds, or the nearest to it."""
-    default = resolve_engine("auto")
+    default = resolve_engine("auto", HEADLINE_WORLDS)
     if not rows:
         return {"task": options.task, "control_steps_per_s": None}
     return min(

@@ -1,4 +1,4 @@
-"""``twirl bench [learner|worlds|startup|epoch|forms|all]``."""
+"""``twirl bench [PART]``."""
 
 from __future__ import annotations
 
@@ -23,8 +23,9 @@ from twirl_mjx.sweep import launch
 PARTS = ("learner", "startup", "epoch", "worlds")
 """Worlds last: they leave out rows when the time is up."""
 
-ALONE = ("forms",)
-"""Parts that `all` leaves out because they take longer than all others together."""
+ALONE = ("forms", "gpu-compile", "gpu-proof", "gpu-table")
+"""Parts that `all` leaves out: they take longer than all others together, or need an environment
+of their own."""
 
 ROW_S = 75.0
 """s, longest that a row of worlds is expected to take, compilation included."""
@@ -36,8 +37,17 @@ parts:
   worlds   control steps per second, beside the bare physics
   startup  seconds from the shell to the first critic updates
   epoch    where the time of a training epoch goes, and peak memory
-  forms    learning curves with every form of the learner (minutes; not in `all`)
-  all      everything, into runs/bench.json and docs/performance.md (default)
+  all      all of these, into runs/bench.json and docs/performance.md (default)
+
+parts that `all` leaves out:
+  forms    learning curves with every form of the learner (minutes)
+  gpu-compile
+           GPU operations per critic update and per physics step, counted without a GPU (minutes;
+           needs make gpu-setup)
+  gpu-proof
+           on a GPU: parity with the CPU, timings, a real training, into runs/gpu-proof (minutes)
+  gpu-table
+           the results of gpu-proof into the tables of docs/accelerators.md
 
 `twirl bench PART --help` lists the options of a part; `--json` prints one JSON document on stdout.
 """
@@ -56,7 +66,7 @@ class AllBench:
     task: str | None = None
     """Task of worlds, start-up and epoch; their own by default."""
     preset: str = "cpu"
-    """Sizes of start-up and epoch: paper, cpu or debug."""
+    """Sizes of start-up and epoch: paper, cpu, massive or debug."""
     out: Path = Path("runs/bench.json")
     """All results."""
     page: Path = Path("docs/performance.md")
@@ -90,19 +100,21 @@ def _part(name: str, argv: list[str]) -> int:
     from twirl_mjx.bench import report
     from twirl_mjx.bench.measure import only_json_on_stdout
 
-    module: Any = importlib.import_module(f"twirl_mjx.bench.{name}")
-    options = parse(getattr(module, f"{name.capitalize()}Bench"), argv, f"twirl bench {name}")
+    module: Any = importlib.import_module(f"twirl_mjx.bench.{name.replace('-', '_')}")
+    kind = "".join(word.capitalize() for word in (*name.split("-"), "bench"))
+    options = parse(getattr(module, kind), argv, f"twirl bench {name}")
     with only_json_on_stdout() as out:
         record = module.measure(options)
         if options.json:
             print(json_text(record), file=out, flush=True)
             return 0
-    report.print_sheets(report.sheets_of({name: record}), record["machine"])
+    parts = record.get("parts", {name: record})
+    report.print_sheets(report.sheets_of(parts), record["machine"])
     return 0
 
 
 def _all(argv: list[str]) -> int:
-    """Run every part within the time; returns 1 if one failed."""
+    """Run every part within the time; returns 1 if the page keeps its tables, see ``doubts``."""
     from twirl_mjx.bench import report
     from twirl_mjx.bench.measure import only_json_on_stdout
 
@@ -116,12 +128,15 @@ def _all(argv: list[str]) -> int:
         if options.json:
             print(json_text(results), file=out, flush=True)
     parts = results["parts"]
-    sheets = report.sheets_of(parts)
-    report.write_section(options.page, report.markdown(sheets, results["machine"]))
+    sheets, doubts = report.sheets_of(parts), report.doubts(parts)
+    if not doubts:
+        report.write_section(options.page, report.markdown(sheets, results["machine"]))
     if not options.json:
         report.print_sheets(sheets, results["machine"])
-        say(f"wrote {options.out} and the tables of {options.page}")
-    return 1 if any("error" in record for record in parts.values()) else 0
+        tables = f"the tables of {options.page}"
+        kept = f"; {tables} stay as they were: {'; '.join(doubts)}" if doubts else f" and {tables}"
+        say(f"wrote {options.out}{kept}")
+    return 1 if doubts else 0
 
 
 def run_parts(options: AllBench) -> dict[str, Any]:

@@ -32,7 +32,7 @@ class CurriculumOptions:
 
     task: str = TrainConfig.task
     """Target task at the heart of the chain."""
-    preset: Annotated[str, tyro.conf.arg(help="paper, cpu or debug")] = ""
+    preset: Annotated[str, tyro.conf.arg(help="paper, cpu, massive or debug")] = ""
     """Settings; cpu without an accelerator, else paper."""
     seed: int = 0
     """Seed of every run."""

@@ -27,7 +27,8 @@ class CollectOptions:
     """Record the source of a run as a dataset, with every stage before it that is missing."""
 
     preset: str
-    """Settings to start from: paper, cpu or debug (default: cpu without an accelerator)."""
+    """Settings to start from: paper, cpu, massive or debug (default: cpu without an accelerator,
+    else paper)."""
     name: str | None
     """Name of the run; derived from task, variant, preset and seed by default."""
     runs: Path

@@ -38,6 +38,9 @@ class DroqConfig:
     """Precision of matrix products; parameters and sums stay float32."""
     fast: bool = True
     """Use the fast form of the update; False is the plain flax/optax form of the same maths."""
+    form: Literal["auto", "fast", "accelerator"] = "auto"
+    """Which fast form: fast is laid out for CPUs, accelerator for GPUs and TPUs, auto for what is
+    used."""
 
     def __post_init__(self) -> None:
         """Check every number.
@@ -57,6 +60,7 @@ class DroqConfig:
         if self.target_entropy is not None:
             check_range("droq.target_entropy", self.target_entropy, -1e4, 1e4)
         check_choice("droq.matmul_dtype", self.matmul_dtype, ("float32", "bfloat16"))
+        check_choice("droq.form", self.form, ("auto", "fast", "accelerator"))
         if not self.hidden_sizes or min(self.hidden_sizes) < 1:
             nearest = tuple(max(1, size) for size in self.hidden_sizes or (128, 128))
             raise ValueError(

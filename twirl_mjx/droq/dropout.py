@@ -38,32 +38,35 @@ def seeds(key: jax.Array, shape: Sequence[int]) -> jax.Array:
 
 
 def hash_bits(seed: jax.Array, num: int) -> jax.Array:
-    """Return 32 random bits for each of the counters 0 .. num - 1.
-
-    The finaliser of MurmurHash3 (Appleby, public domain) with the seed entering twice, before and
-    between its rounds, so that two seeds never give shifted copies of one stream.
+    """Return 32 random bits for each of the counters 0 .. num - 1: [num] uint32.
 
     Args:
         seed: [2] uint32.
         num: Number of counters.
-
-    Returns:
-        [num] uint32.
     """
-    bits = jnp.arange(num, dtype=jnp.uint32) ^ seed[0]
+    return _hash(seed, jnp.arange(num, dtype=jnp.uint32))
+
+
+def _hash(seed: jax.Array, counter: jax.Array) -> jax.Array:
+    """Return 32 random bits for every counter.
+
+    The finaliser of MurmurHash3 (Appleby, public domain) with the seed entering twice, before and
+    between its rounds, so that two seeds never give shifted copies of one stream.
+    """
+    bits = counter ^ seed[0]
     bits = (bits ^ (bits >> 16)) * jnp.uint32(0x85EBCA6B) + seed[1]
     bits = (bits ^ (bits >> 13)) * jnp.uint32(0xC2B2AE35)
     return bits ^ (bits >> 16)
 
 
 def keep_mask(seed: jax.Array, shape: tuple[int, int, int], rate: float) -> jax.Array:
-    """Return the bool mask [E, B, H] of the elements to keep.
+    """Return the bool mask of the elements to keep, in the shape that is given.
 
     One hash serves two ensemble members: its low half the even one, its high half the odd one.
 
     Args:
         seed: [2] uint32.
-        shape: Ensemble members E, rows B, units H.
+        shape: Ensemble members E first, then rows and units in either order.
         rate: Probability of dropping an element, rounded to a multiple of 1 / RESOLUTION.
     """
     num_critics, rows, units = shape
@@ -71,3 +74,16 @@ def keep_mask(seed: jax.Array, shape: tuple[int, int, int], rate: float) -> jax.
     bits = hash_bits(seed, pairs * rows * units).reshape(pairs, rows, units)
     halves = jnp.stack([bits & 0xFFFF, bits >> 16], axis=1)
     return halves.reshape(2 * pairs, rows, units)[:num_critics] >= threshold(rate)
+
+
+def keep_mask_by_element(seed: jax.Array, shape: tuple[int, int, int], rate: float) -> jax.Array:
+    """Return the mask of :func:`keep_mask`, every element by itself.
+
+    It hashes twice as often and stores nothing, so that a GPU can make it where it is used instead
+    of in a kernel of its own.
+    """
+    member, row, column = (jax.lax.broadcasted_iota(jnp.uint32, shape, i) for i in range(3))
+    place = row * jnp.uint32(shape[2]) + column
+    counter = (member // 2) * jnp.uint32(shape[1] * shape[2]) + place
+    half = (_hash(seed, counter) >> (16 * (member % 2))) & 0xFFFF
+    return half >= threshold(rate)

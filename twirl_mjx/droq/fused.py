@@ -14,7 +14,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from twirl_mjx.droq import dropout
 from twirl_mjx.droq.networks import LAYER_NORM_EPSILON, dot_general
 
 _materialise = jax.lax.optimization_barrier
@@ -148,13 +147,3 @@ def _affine_relu(
     """Return ReLU(scale (x - mean) / std + bias), [E, H, B]."""
     normalised = (x - mean[:, None]) * inverse_std[:, None]
     return jnp.maximum(normalised * scale[:, :, None] + bias[:, :, None], 0.0)
-
-
-def ensemble_masks(
-    seeds: jax.Array, num_critics: int, hidden_sizes: tuple[int, ...], rows: int, rate: float
-) -> list[jax.Array]:
-    """Return one keep mask [E, H_i, B] per hidden layer from hash seeds [layers, 2]."""
-    return [
-        dropout.keep_mask(seeds[i], (num_critics, size, rows), rate)
-        for i, size in enumerate(hidden_sizes)
-    ]

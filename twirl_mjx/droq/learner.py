@@ -12,7 +12,7 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
-from twirl_mjx.droq import fast, losses, networks, plain
+from twirl_mjx.droq import forms, losses, networks
 from twirl_mjx.droq.config import DroqConfig
 from twirl_mjx.droq.networks import Params
 from twirl_mjx.droq.state import CriticState, DroqState, adam_init, adam_step
@@ -74,10 +74,9 @@ def update(
         values of the one actor and temperature step.
     """
     next_key, noise_key, critic_key, actor_key = jax.random.split(key, 4)
-    form = fast if config.fast else plain
     next_noise = jax.random.normal(next_key, minibatches.action.shape)
     critic_state = CriticState(state.critic, state.target_critic, state.critic_opt)
-    critic_state, critic_metrics = form.critic_block(
+    critic_state, critic_metrics = forms.form_of(config).critic_block(
         critic_state,
         state.actor,
         jnp.exp(state.log_temperature),
@@ -113,11 +112,10 @@ def actor_step(
         The state with another actor and temperature, and metrics.
     """
     temperature = jnp.exp(state.log_temperature)
-    critic_q = fast.critic_q if config.fast else plain.critic_q
+    critic_q = forms.form_of(config).critic_q
 
     def actor_loss_fn(actor: Params) -> tuple[jax.Array, jax.Array]:
-        mean, log_std = networks.actor_distribution(actor, obs, config.matmul_dtype)
-        action, log_prob = networks.squash(mean, log_std, noise)
+        action, log_prob = networks.act(actor, obs, noise, config.matmul_dtype)
         q = critic_q(state.critic, obs, action, config, key)
         return losses.actor_loss(log_prob, q, temperature), -jnp.mean(log_prob)
 

@@ -139,6 +139,20 @@ def _dense(layer: Params, x: jax.Array, *, matmul_dtype: str) -> jax.Array:
     return dot_general(x, layer["kernel"], dimension_numbers, matmul_dtype) + layer["bias"]
 
 
+def act(
+    params: Params, obs: jax.Array, noise: jax.Array, matmul_dtype: str = "float32"
+) -> tuple[jax.Array, jax.Array]:
+    """Return the actor's actions [..., A] and their log-densities [...] in nats.
+
+    Args:
+        params: Actor parameters.
+        obs: [..., O] observations.
+        noise: [..., A] standard normal draws.
+        matmul_dtype: Number format of the operands of the matrix products.
+    """
+    return squash(*actor_distribution(params, obs, matmul_dtype), noise)
+
+
 def squash(mean: jax.Array, log_std: jax.Array, noise: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Return action tanh(u), u = mean + std * noise, and its log-density.
 

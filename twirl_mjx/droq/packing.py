@@ -1,8 +1,6 @@
-"""Critic parameters in the layout of the fast update, and back.
+"""Critic parameters as a handful of arrays, for Adam and Polyak, and back.
 
-The fast update keeps activations as [E, H, B], batch last. Kernels are then [out, in], the first
-one covers all critics at once and carries its bias as a last column, and every other vector lies
-in one matrix, so that Adam and Polyak touch a handful of arrays.
+The first kernel carries its bias as a last row, and every other vector lies in one matrix.
 """
 
 from __future__ import annotations
@@ -21,7 +19,8 @@ class PackedCritic(flax.struct.PyTreeNode):
     """Parameters (or gradients, or moments) of E critics; built by ``pack``."""
 
     kernels: tuple[jax.Array, ...]
-    """First [1, E * H0, O + A + 1] with the bias as last column; the others [E, H_i, H_(i-1)]."""
+    """First [E, O + A + 1, H_0] with the bias as last row; the others [E, H_(i-1), H_i]. A
+    ``hoisted.Layout`` may turn them."""
     vectors: jax.Array
     """[E, V], the columns listed by ``vector_sizes``."""
 
@@ -41,17 +40,16 @@ def split_vectors(vectors: jax.Array, hidden_sizes: Sequence[int]) -> list[jax.A
 
 
 def pack(critic: Params, hidden_sizes: Sequence[int]) -> PackedCritic:
-    """Arrange critic parameters for the fast update."""
+    """Gather critic parameters in a few arrays."""
     num_layers = len(hidden_sizes)
     hidden = [critic[f"hidden_{i}"] for i in range(num_layers)]
     first = jnp.concatenate([hidden[0]["kernel"], hidden[0]["bias"][:, None]], axis=1)
-    first = first.transpose(0, 2, 1).reshape(1, -1, first.shape[1])
     vectors = [layer["bias"] for layer in hidden[1:]]
     for i in range(num_layers):
         vectors += [critic[f"norm_{i}"]["scale"], critic[f"norm_{i}"]["bias"]]
     vectors += [critic["out"]["kernel"][..., 0], critic["out"]["bias"]]
     return PackedCritic(
-        kernels=(first, *(layer["kernel"].transpose(0, 2, 1) for layer in hidden[1:])),
+        kernels=(first, *(layer["kernel"] for layer in hidden[1:])),
         vectors=jnp.concatenate(vectors, axis=1),
     )
 
@@ -59,13 +57,11 @@ def pack(critic: Params, hidden_sizes: Sequence[int]) -> PackedCritic:
 def unpack(packed: PackedCritic, hidden_sizes: Sequence[int]) -> Params:
     """Undo ``pack``."""
     num_layers = len(hidden_sizes)
-    num_critics = packed.vectors.shape[0]
     vectors = split_vectors(packed.vectors, hidden_sizes)
-    first = packed.kernels[0].reshape(num_critics, hidden_sizes[0], -1).transpose(0, 2, 1)
+    first = packed.kernels[0]
     critic = {"hidden_0": {"kernel": first[:, :-1], "bias": first[:, -1]}}
     for i in range(1, num_layers):
-        kernel = packed.kernels[i].transpose(0, 2, 1)
-        critic[f"hidden_{i}"] = {"kernel": kernel, "bias": vectors[i - 1]}
+        critic[f"hidden_{i}"] = {"kernel": packed.kernels[i], "bias": vectors[i - 1]}
     norms = vectors[num_layers - 1 : -2]
     for i in range(num_layers):
         critic[f"norm_{i}"] = {"scale": norms[2 * i], "bias": norms[2 * i + 1]}

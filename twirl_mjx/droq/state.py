@@ -1,4 +1,4 @@
-"""State of the learner and the Adam rule that both forms of the update share."""
+"""State of the learner, and what all forms of the update do to parameters."""
 
 from __future__ import annotations
 
@@ -67,3 +67,8 @@ def adam_step(
 def polyak(target: Any, online: Any, tau: float) -> Any:
     """Return target + tau (online - target)."""
     return jax.tree.map(lambda t, o: t + tau * (o - t), target, online)
+
+
+def squared_norm(tree: Any) -> jax.Array:
+    """Return the sum of squares of all entries of all leaves."""
+    return sum((jnp.sum(jnp.square(leaf)) for leaf in jax.tree.leaves(tree)), jnp.zeros(()))

@@ -52,29 +52,54 @@ class Engine(Protocol):
         ...
 
 
-def resolve_engine(name: EngineName) -> Literal["mjx", "native"]:
-    """Return the engine for ``auto``: MJX on an accelerator, C MuJoCo on a CPU."""
+MJX_FROM = 1024
+"""Worlds from which ``auto`` is MJX on an accelerator. An estimate: no card has been measured. A
+control step of MJX is about 7,000 launches whatever the number of worlds, 15 to 20 ms, in which
+the threads of a host step some hundreds of worlds (docs/accelerators.md)."""
+
+
+def resolve_engine(name: EngineName, num_envs: int) -> Literal["mjx", "native"]:
+    """Return the engine for ``auto``: C MuJoCo on a CPU and for few worlds, else MJX."""
     if name != "auto":
         return name
-    return "native" if jax.default_backend() == "cpu" else "mjx"
+    few = num_envs < MJX_FROM
+    return "native" if few or jax.default_backend() == "cpu" else "mjx"
 
 
-def make_engine(name: EngineName, scene: Scene, threads: int | None = None) -> Engine:
+def make_engine(
+    name: EngineName, scene: Scene, num_envs: int, threads: int | None = None
+) -> Engine:
     """Return the engine called ``name`` for a scene.
 
     Args:
         name: ``auto``, ``mjx`` or ``native``.
         scene: The compiled scene.
+        num_envs: Worlds that it will step, which decide what ``auto`` is.
         threads: Host threads of the native engine; the CPUs this process may use by default.
 
     Raises:
-        ValueError: Unknown name.
+        ValueError: Unknown name, or the native engine where jax may not use the host.
     """
     if name not in ("auto", "mjx", "native"):
         raise ValueError(f"unknown engine {name!r}: choose auto, mjx or native")
-    if resolve_engine(name) == "mjx":
+    if resolve_engine(name, num_envs) == "mjx":
         return MjxEngine(scene)
+    check_host()
     return NativeEngine(scene, threads or len(usable_cores()))
+
+
+def check_host() -> None:
+    """Refuse the native engine where jax has no CPU device: its callbacks run there.
+
+    Raises:
+        ValueError: ``JAX_PLATFORMS`` names accelerators alone.
+    """
+    platforms = jax.config.jax_platforms or ""
+    if platforms and "cpu" not in platforms.split(","):
+        raise ValueError(
+            f"JAX_PLATFORMS={platforms} hides the CPU, where engine native steps its worlds"
+            f" (nearest: JAX_PLATFORMS={platforms},cpu; or --engine mjx)"
+        )
 
 
 def make_data(scene: Scene, num_envs: int) -> mjx.Data:

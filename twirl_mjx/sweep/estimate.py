@@ -78,7 +78,8 @@ def _rates(path: Path) -> tuple[float, float] | None:
 
 def _learner(config: TrainConfig) -> tuple[object, ...]:
     droq = config.droq
-    return (droq.hidden_sizes, droq.num_critics, droq.batch_size, droq.matmul_dtype, droq.fast)
+    sizes = (droq.hidden_sizes, droq.num_critics, droq.batch_size)
+    return (*sizes, droq.matmul_dtype, droq.fast, droq.form)
 
 
 def _setting(config: TrainConfig) -> tuple[object, ...]:

@@ -79,7 +79,8 @@ def train(
     Args:
         task: Name, ``file.py:Name``, or a task class of your own.
         seeds: Several seeds, trained in one program: a list of results, in their order.
-        preset: ``paper``, ``cpu`` or ``debug``; ``cpu`` without an accelerator, else ``paper``.
+        preset: ``paper``, ``cpu``, ``massive`` or ``debug``; ``cpu`` without an accelerator, else
+            ``paper``.
         source: A policy object (``types.SourcePolicy``), or what ``--source`` takes.
         name: Name of the run; derived from task, variant, preset and seed by default.
         runs: Folder of all runs.

@@ -1,4 +1,4 @@
-"""Named settings: the paper's numbers, two CPU cores, and seconds for tests."""
+"""Named settings: the paper's numbers, two CPU cores, one GPU full of worlds, seconds for tests."""
 
 from __future__ import annotations
 
@@ -24,6 +24,20 @@ SETTINGS: dict[str, Mapping[str, Any]] = {
         "droq.discount": 0.97,  # leaves the safe poor optimum of sitting
         "eval.every": 96_000,
         "eval.episodes": 32,
+    },
+    "massive": {  # few updates of large batches per transition; a start, trained on no card yet
+        "total_env_steps": 40_960_000,
+        "warmup_env_steps": 40_960,
+        "epoch_env_steps": 204_800,
+        "num_envs": 2048,
+        "droq.utd": 32 / 2048,
+        "droq.updates_per_block": 8,
+        "droq.batch_size": 8192,
+        "droq.initial_temperature": 0.1,
+        "droq.discount": 0.97,
+        "replay.capacity": 2_048_000,
+        "eval.every": 2_048_000,
+        "eval.episodes": 128,
     },
     "debug": {
         "total_env_steps": 96,
@@ -63,7 +77,7 @@ def make_config(
     Args:
         task: Name of a task, or ``file.py:Name``.
         preset: ``paper`` (the paper's numbers), ``cpu`` (the same method, settings for two CPU
-            cores) or ``debug`` (seconds, for tests).
+            cores), ``massive`` (thousands of worlds on one GPU) or ``debug`` (seconds, for tests).
         learner: Name of the learner, or ``file.py:NAME``; of DroQ's settings in a preset it takes
             those that it has too.
 

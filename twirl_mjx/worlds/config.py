@@ -67,7 +67,8 @@ class WorldConfig:
     episode_length: int = 400
     """Control steps before an episode is truncated (400: 20 s at 20 Hz)."""
     engine: Literal["auto", "mjx", "native"] = "auto"
-    """Physics engine; auto is mjx on an accelerator and native (C MuJoCo threads) on a CPU."""
+    """Physics engine; auto is native (C MuJoCo threads) on a CPU and below 1,024 worlds, else
+    mjx."""
     uses: tuple[str, ...] = ()
     """file.py:Name of everything named above that is not built in; filled in by itself."""
 

@@ -51,11 +51,12 @@ def _bind(
     kind = scene_kind or get_shift(config.shift).scene
     scene = build_scene(kind, robot=task.robot, collision=task.collision, options=SimOptions())
     how = (num_envs, scene_kind, threads)
+    worlds = num_envs or config.num_envs
     return VectorEnv(
         task,
         scene,
-        make_engine(config.engine, scene, threads),
-        num_envs=num_envs or config.num_envs,
+        make_engine(config.engine, scene, worlds, threads),
+        num_envs=worlds,
         episode_length=config.episode_length,
         dynamics=config.make_dynamics(),
         metric_names=check_task(task, scene),

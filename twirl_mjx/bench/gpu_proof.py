@@ -1,0 +1,329 @@
+"""What a GPU does with this program, in one call: parity, timings, a real training (minutes).
+
+Made for a machine that is lent for minutes: everything has a deadline, what fails becomes a row
+that says why, and what was found lies in a few small files from the moment it is known. A second
+call goes on from them: measured rows are not measured again, and the training resumes.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import json
+import os
+import signal
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from twirl_mjx import files
+from twirl_mjx.bench import parity
+from twirl_mjx.bench.measure import Record, progress, summary
+from twirl_mjx.bench.worker import Worker
+from twirl_mjx.checks import check_choice, check_range
+from twirl_mjx.tasks.registry import TASKS
+from twirl_mjx.training.presets import PRESETS
+
+PARITY, TIMINGS, TRAINING, MACHINE = "parity.csv", "timings.csv", "training.csv", "machine.json"
+"""What a proof leaves in its folder, beside the runs of the training."""
+COLUMNS: dict[str, dict[str, type]] = {
+    PARITY: {"name": str, "error": float, "tolerance": float},
+    TIMINGS: {"name": str, "unit": str, "rate": float, "spread": float, "ready_s": float}
+    | {"fault": str},
+    TRAINING: {"seed": int, "env_steps": int, "grad_steps": int, "wall_s": float}
+    | {"updates_per_s": float, "eval_return": float},
+}
+"""Table -> its columns."""
+GRAPHS = "--xla_gpu_enable_command_buffer=+WHILE --xla_gpu_command_buffer_unroll_loops=true"
+NO_GRAPHS = "--xla_gpu_enable_command_buffer="
+SAVING_S = 60.0
+"""s that a training is given to evaluate, save and stop."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Variant:
+    """One thing to time, in a process of its own."""
+
+    name: str
+    kind: str
+    """``learner`` or ``worlds``."""
+    options: Mapping[str, Any]
+    """See ``worker.Worker``."""
+    environment: Mapping[str, str] = dataclasses.field(default_factory=dict)
+
+    @property
+    def unit(self) -> str:
+        """What its rate counts."""
+        return {"learner": "critic updates/s", "worlds": "control steps/s"}[self.kind]
+
+
+@dataclasses.dataclass(frozen=True)
+class GpuProofBench:
+    """Check and time a GPU, then train on it until the time is over; goes on where it stopped."""
+
+    json: bool = False
+    """Print one JSON document on stdout, and nothing else."""
+    minutes: float = 9.0
+    """Time for everything."""
+    out: Path = Path("runs/gpu-proof")
+    """Folder of the results; a second call goes on from what is there."""
+    task: str = "biped"
+    """Task of the training."""
+    preset: str = "cpu"
+    """Settings of the training; those of cpu reach a result soonest."""
+    seeds: int = 8
+    """Seeds of the training, one program."""
+    seconds: float = 3.0
+    """Length of each timing in s."""
+    tiny: bool = False
+    """Small networks and few variants: to try the command itself, on any machine."""
+
+    def __post_init__(self) -> None:
+        """Check names and numbers.
+
+        Raises:
+            ValueError: Unknown name, or a value out of range.
+        """
+        check_choice("task", self.task, TASKS.names())
+        check_choice("preset", self.preset, PRESETS)
+        check_range("minutes", self.minutes, 0.1, 600.0)
+        check_range("seeds", self.seeds, 1, 1000)
+        check_range("seconds", self.seconds, 0.1, 600.0)
+
+
+def variants(options: GpuProofBench) -> list[Variant]:
+    """Return what is timed, the most telling first: the time may end before the last."""
+
+    def learner(form: str, seeds: int, label: str = "", flags: str = "", **more: Any) -> Variant:
+        sizes: dict[str, Any] = {"form": form, "seeds": seeds, "workers": 0, **more}
+        if options.tiny:
+            sizes |= {"obs": 5, "action": 2, "batch": 16, "hidden": 16, "utd": 2}
+        name = f"{form}, seeds {seeds}" + (f", {label}" if label else "")
+        return Variant(name, "learner", sizes, {"XLA_FLAGS": flags} if flags else {})
+
+    def worlds(engine: str, num_envs: int) -> Variant:
+        settings = {"task": options.task, "engine": engine, "num_envs": num_envs}
+        return Variant(f"{engine}, worlds {num_envs}", "worlds", settings)
+
+    if options.tiny:
+        return [learner("plain", 1), learner("accelerator", 2), worlds("native", 2)]
+    return [
+        *(learner(form, seeds) for seeds in (1, 8) for form in ("accelerator", "fast", "plain")),
+        *(worlds("mjx", number) for number in (1024, 4096)),
+        *(worlds("native", number) for number in (128, 1024)),
+        learner("accelerator", 1, "loops in graphs", GRAPHS),
+        learner("accelerator", 8, "loops in graphs", GRAPHS),
+        learner("accelerator", 1, "no graphs", NO_GRAPHS),
+        learner("accelerator", 32),
+        learner("accelerator", 8, "bfloat16", matmul_dtype="bfloat16"),
+        *(worlds("mjx", number) for number in (256, 8192)),
+        learner("accelerator", 128),
+    ]
+
+
+class Folder:
+    """The small files of a proof. A disk that refuses them is named once, and the proof goes on."""
+
+    def __init__(self, path: Path) -> None:
+        """Keep the place; nothing is made yet."""
+        self.path = path
+        self._refused = False
+
+    def read(self, table: str) -> list[Record]:
+        """Return the rows of a table that an earlier call left."""
+        path = self.path / table
+        if not path.exists():
+            return []
+        return list(files.read_rows(path, "a table of a proof", COLUMNS[table]))
+
+    def write(self, table: str, rows: Sequence[Record]) -> None:
+        """Leave the rows of a table."""
+        names = list(COLUMNS[table])
+        with self._unless_refused(table):
+            files.make_folders(self.path)
+            lines = [[row[name] for name in names] for row in rows]
+            files.write_csv(self.path / table, [names, *lines])
+
+    def write_machine(self, record: Record) -> None:
+        """Leave what the numbers depend on."""
+        with self._unless_refused(MACHINE):
+            files.make_folders(self.path)
+            files.write_json(self.path / MACHINE, record)
+
+    @contextlib.contextmanager
+    def _unless_refused(self, name: str) -> Any:
+        try:
+            yield
+        except OSError as error:
+            if not self._refused:
+                progress(f"bench gpu-proof: {name} could not be written, going on: {error}")
+            self._refused = True
+
+
+def environment() -> dict[str, str]:
+    """Return what every process of a proof sees: no process takes the whole memory of a GPU."""
+    return {"XLA_PYTHON_CLIENT_PREALLOCATE": "false"}
+
+
+def find_machine(limit: float) -> Record:
+    """Return ``measure.machine()`` of a process of its own: this one leaves the GPU alone.
+
+    Raises:
+        RuntimeError: jax found no device, or not in time.
+    """
+    code = "import json; from twirl_mjx.bench.measure import machine; print(json.dumps(machine()))"
+    try:
+        done = subprocess.run(
+            [sys.executable, "-c", code],
+            env={**os.environ, **environment()},
+            capture_output=True,
+            text=True,
+            timeout=max(1.0, limit),
+            check=False,
+        )
+    except subprocess.TimeoutExpired:
+        raise RuntimeError(f"jax found no device in {limit:.0f} s (--minutes)") from None
+    if done.returncode:
+        raise RuntimeError(f"jax found no device: {done.stderr.strip()[-300:]}")
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def prove_parity(options: GpuProofBench, folder: Folder, deadline: float) -> Record:
+    """Compare learner, physics and an epoch of this device with those of the CPU."""
+    rows = folder.read(PARITY)
+    if rows:
+        return {"rows": rows}
+    progress("bench gpu-proof: parity with the CPU")
+    try:
+        files.make_folders(folder.path)
+        found = []
+        for name, platform in (("reference.npz", {"JAX_PLATFORMS": "cpu"}), ("numbers.npz", {})):
+            left = max(1.0, deadline - time.monotonic())
+            given = {**environment(), **platform}
+            engines = parity.ENGINES[:1] if options.tiny else parity.ENGINES
+            found.append(parity.write(folder.path / name, given, left, engines))
+    except (OSError, RuntimeError, subprocess.TimeoutExpired) as error:
+        return {"error": f"parity: {error}"}
+    rows = [
+        {"name": name, "error": error, "tolerance": parity.TOLERANCE[name.split(".")[0]]}
+        for name, error in parity.errors(found[1], found[0]).items()
+    ]
+    folder.write(PARITY, rows)
+    return {"rows": rows}
+
+
+def time_variants(options: GpuProofBench, folder: Folder, deadline: float) -> Record:
+    """Compile all variants at once, then time each alone; what fails is a row with its reason."""
+    rows = [row for row in folder.read(TIMINGS) if not row["fault"]]
+    known = {row["name"] for row in rows}
+    missing = [variant for variant in variants(options) if variant.name not in known]
+    progress(f"bench gpu-proof: compiling {len(missing)} variants, {len(known)} are measured")
+    began = time.monotonic()
+    with contextlib.ExitStack() as stack:
+        ready: list[tuple[Variant, Worker, float]] = []
+        waiting = []
+        for variant in missing:
+            given = {**environment(), **variant.environment}
+            worker = Worker(variant.kind, dict(variant.options), environment=given)
+            waiting.append((variant, stack.enter_context(worker)))
+        for variant, worker in waiting:
+            try:
+                worker.wait_until_ready(max(1.0, deadline - time.monotonic()))
+                ready.append((variant, worker, time.monotonic() - began))
+            except RuntimeError as error:
+                rows.append(_row(variant, fault=str(error)))
+        for variant, worker, ready_s in ready:
+            progress(f"bench gpu-proof: {variant.name}")
+            try:
+                worker.start(options.seconds)
+                found = summary(worker.samples(10 * options.seconds + 60))
+                rows.append(_row(variant, found["median"], found["spread"], ready_s))
+            except (RuntimeError, OSError, ValueError) as error:
+                rows.append(_row(variant, fault=str(error)))
+            folder.write(TIMINGS, rows)
+    folder.write(TIMINGS, rows)
+    return {"rows": rows}
+
+
+def _row(
+    variant: Variant, rate: float = 0.0, spread: float = 0.0, ready_s: float = 0.0, fault: str = ""
+) -> Record:
+    return {
+        "name": variant.name,
+        "unit": variant.unit,
+        "rate": rate,
+        "spread": spread,
+        "ready_s": round(ready_s, 1),
+        "fault": fault,
+    }
+
+
+def train(options: GpuProofBench, folder: Folder, deadline: float) -> Record:
+    """Train all seeds in one program until the deadline; the same call resumes them."""
+    left = deadline - time.monotonic()
+    minutes = (left - SAVING_S) / 60.0 if left > 2 * SAVING_S else left / 120.0
+    runs = folder.path / "runs"
+    words = ["--task", options.task, "--preset", options.preset, "--runs", str(runs)]
+    words += ["--seeds", *map(str, range(options.seeds)), "--minutes", f"{max(minutes, 0.01):.2f}"]
+    progress(f"bench gpu-proof: training {options.seeds} seeds for {minutes:.1f} min")
+    process = subprocess.Popen(
+        [sys.executable, "-m", "twirl_mjx", "train", *words],
+        stdout=sys.stderr,
+        env={**os.environ, **environment()},
+    )
+    try:
+        status = process.wait(timeout=max(1.0, left))
+    except subprocess.TimeoutExpired:
+        process.send_signal(signal.SIGTERM)  # it saves and stops
+        try:
+            status = process.wait(timeout=SAVING_S)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            status = process.wait()
+    rows = [row for seed in range(options.seeds) for row in _progress_of(runs, seed)]
+    folder.write(TRAINING, rows)
+    record: Record = {"rows": rows, "status": status, "task": options.task}
+    return record | {"preset": options.preset}
+
+
+def _progress_of(runs: Path, seed: int) -> list[Record]:
+    """Return how far the run of a seed is, or nothing; the run of its source is another task's."""
+    columns = {"metric": str, "env_steps": int, "grad_steps": int, "wall_s": float, "value": float}
+    for path in sorted(runs.glob(f"*-s{seed}/metrics.csv")):
+        rows = files.read_rows(path, "the metrics of a run", columns, growing=True)
+        by_name: dict[str, list[Record]] = {}
+        for row in rows:
+            by_name.setdefault(row["metric"], []).append(row)
+        if not by_name:
+            continue
+        last = max((each[-1] for each in by_name.values()), key=lambda row: row["env_steps"])
+        rates = [row["value"] for row in by_name.get("updates_per_s", []) if row["value"] > 0]
+        returns = [row["value"] for row in by_name.get("eval/return", [])]
+        return [
+            {
+                "seed": seed,
+                "env_steps": last["env_steps"],
+                "grad_steps": last["grad_steps"],
+                "wall_s": last["wall_s"],
+                "updates_per_s": statistics.median(rates) if rates else 0.0,
+                "eval_return": returns[-1] if returns else float("nan"),
+            }
+        ]
+    return []
+
+
+def measure(options: GpuProofBench) -> Record:
+    """Prove, time and train within the time; nothing that was found is lost on the way."""
+    began = time.monotonic()
+    whole = 60.0 * options.minutes
+    folder = Folder(options.out)
+    machine = find_machine(whole / 4)
+    folder.write_machine(machine)
+    parts = {"gpu-parity": prove_parity(options, folder, began + 0.3 * whole)}
+    parts["gpu-timings"] = time_variants(options, folder, began + 0.5 * whole)
+    parts["gpu-training"] = train(options, folder, began + whole)
+    return {"part": "gpu-proof", "parts": parts, "machine": machine}
