@@ -6,13 +6,13 @@ TWIRL := .venv/bin/twirl
 PYTEST := .venv/bin/pytest
 CASE = $(if $(TASK),--task $(TASK)) $(if $(SHIFT),--shift $(SHIFT)) $(if $(SEED),--seed $(SEED))
 
-.PHONY: help setup bench-setup gpu-setup test-gpu test-jax-oldest gpu-counts gpu-proof lint \
-	format test test-slow train evaluate collect sweep figures report render view demo bench \
+.PHONY: help setup bench-setup gpu-setup lint format test test-slow test-gpu test-jax-oldest \
+	gpu-counts gpu-proof train evaluate collect sweep figures report render view demo bench \
 	curriculum docs dist clean
 
 help: ## show this table
 	@echo 'usage: make TARGET [TASK=..] [SHIFT=..] [SEED=..] [RUN=..] [GRID=..] [ARGS=".."]'
-	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  %-12s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  %-16s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
 	@echo 'ARGS is handed on as it is: make train TASK=biped ARGS="--preset debug"'
 	@echo 'All options of a command: .venv/bin/twirl COMMAND --help'
 

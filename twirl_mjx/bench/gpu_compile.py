@@ -32,6 +32,7 @@ from twirl_mjx.training import state as training
 from twirl_mjx.training.config import TrainConfig
 from twirl_mjx.training.presets import make_config
 from twirl_mjx.types import Transition
+from twirl_mjx.worlds.config import WorldConfig
 from twirl_mjx.worlds.make import make_env
 from twirl_mjx.worlds.vector import VectorEnv
 
@@ -60,7 +61,7 @@ class GpuCompileBench:
     """Learners in one program."""
     num_envs: int = 1024
     """Worlds of the program worlds."""
-    task: str = "biped"
+    task: str = WorldConfig.task
     """Task of epoch and worlds."""
     card: str = "h100"
     """Card to compile for: h100 or h200."""

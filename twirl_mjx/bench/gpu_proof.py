@@ -27,6 +27,7 @@ from twirl_mjx.bench.worker import Worker
 from twirl_mjx.checks import check_choice, check_range
 from twirl_mjx.tasks.registry import TASKS
 from twirl_mjx.training.presets import PRESETS
+from twirl_mjx.worlds.config import WorldConfig
 
 PARITY, TIMINGS, TRAINING, MACHINE = "parity.csv", "timings.csv", "training.csv", "machine.json"
 """What a proof leaves in its folder, beside the runs of the training."""
@@ -71,7 +72,7 @@ class GpuProofBench:
     """Time for everything."""
     out: Path = Path("runs/gpu-proof")
     """Folder of the results; a second call goes on from what is there."""
-    task: str = "biped"
+    task: str = WorldConfig.task
     """Task of the training."""
     preset: str = "cpu"
     """Settings of the training; those of cpu reach a result soonest."""

@@ -20,6 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from twirl_mjx import array_files
+from twirl_mjx.bench.measure import DEFAULT_TASK
 from twirl_mjx.droq import forms, learner
 from twirl_mjx.droq.config import DroqConfig
 from twirl_mjx.training import state as training
@@ -70,7 +71,7 @@ def learner_numbers() -> Numbers:
 
 def physics_numbers(engine: str) -> Numbers:
     """Return a few control steps of ``stand`` under the same actions."""
-    env = make("stand", num_envs=WORLDS, engine=engine)
+    env = make(DEFAULT_TASK, num_envs=WORLDS, engine=engine)
     actions = np.random.default_rng(5).uniform(-1, 1, (STEPS, WORLDS, ACTION)).astype(np.float32)
 
     def step(state: Any, action: jax.Array) -> Any:
@@ -87,7 +88,7 @@ def physics_numbers(engine: str) -> Numbers:
 
 def epoch_numbers() -> Numbers:
     """Return the metrics of a first epoch with updates: warm-up, acting, rings, learner."""
-    base = dataclasses.replace(make_config("stand", "debug"), variant="scratch")
+    base = dataclasses.replace(make_config(DEFAULT_TASK, "debug"), variant="scratch")
     config = dataclasses.replace(base, engine="native", warmup_env_steps=8)
     env = make_env(config)
     state = training.init(config, env, jax.random.key(0), None)

@@ -17,7 +17,7 @@ from twirl_mjx.checks import check_choice, check_range
 from twirl_mjx.commands.console import parse, say
 from twirl_mjx.commands.render import FILM_SECONDS, RenderOptions, config_of, record
 from twirl_mjx.deploy.conditions import CONTROL_HZ, SHIFTS, RehearsalConfig
-from twirl_mjx.deploy.reference import TASKS
+from twirl_mjx.deploy.reference import BIPED, TASKS
 from twirl_mjx.policies.learned import BEST_POLICY, LAST_POLICY, resolve_policy_path
 
 if TYPE_CHECKING:
@@ -134,7 +134,7 @@ def _cast(options: ViewOptions) -> dict[str, Actor]:
     folder = asset_path("policies")
     shipped = {path.stem: Actor(path) for path in sorted(folder.glob("*.npz"))}
     if not options.policy:
-        first = {"biped": shipped.pop("biped")._replace(task=options.task)}
+        first = {BIPED: shipped.pop(BIPED)._replace(task=options.task)}
         return first | shipped
     first = _named(options)
     others = {k: v for k, v in shipped.items() if v.policy != Path(options.policy)}

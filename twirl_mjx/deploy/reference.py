@@ -12,8 +12,9 @@ from typing import NamedTuple
 import numpy as np
 
 HISTORY = 3
-UPRIGHT_TASKS = ("stand", "biped")
-TASKS = (*UPRIGHT_TASKS, "hurdles", "imitate")
+STAND, BIPED, HURDLES, IMITATE = "stand", "biped", "hurdles", "imitate"
+UPRIGHT_TASKS = (STAND, BIPED)
+TASKS = (*UPRIGHT_TASKS, HURDLES, IMITATE)
 """Tasks that can be rehearsed."""
 
 STANDING_COSINE = 0.7
@@ -23,10 +24,10 @@ PASSED = 0.4
 """m past a hurdle at which the goal moves on to the next."""
 
 FALL_PARTS = {
-    "stand": ("trunk", "head", "hip", "thigh", "calf"),
-    "biped": ("trunk", "head", "hip", "thigh"),
-    "hurdles": ("trunk", "head"),
-    "imitate": ("trunk", "head", "hip", "thigh"),
+    STAND: ("trunk", "head", "hip", "thigh", "calf"),
+    BIPED: ("trunk", "head", "hip", "thigh"),
+    HURDLES: ("trunk", "head"),
+    IMITATE: ("trunk", "head", "hip", "thigh"),
 }
 """Parts of the robot whose ground contact ends an episode (README, "Deviations and decisions")."""
 
@@ -117,7 +118,7 @@ class Score:
 
     def goal(self, goal: np.ndarray) -> np.ndarray:
         """Return the goal [2] m: the next hurdle where there are hurdles, else ``goal``."""
-        if self.task != "hurdles":
+        if self.task != HURDLES:
             return goal
         return np.array([self.hurdles[min(self.passed, len(self.hurdles) - 1)], 0.0])
 
@@ -151,13 +152,13 @@ class Score:
             self.standing_steps += 1
         to_goal = goal - qpos[:2]
         distance = float(np.linalg.norm(to_goal))
-        if self.task == "hurdles":
+        if self.task == HURDLES:
             reward = self._hurdles(qpos, qvel)
         else:
             foot_centre = float(front_feet.mean()) + 0.02
             height = foot_centre if self._rewards_front_feet() else qpos[2] - ground
             reward = (0.5 * cosine + 0.5) ** 2 + np.exp(height) - 1.0
-        if self.task == "biped":
+        if self.task == BIPED:
             facing = -rotation[:2, 2] @ to_goal / max(distance, 1e-6)
             nearer = 0.5 if distance < self.previous_distance else 0.0
             progress = 1.0 if distance <= 0.01 else nearer
@@ -173,10 +174,10 @@ class Score:
 
     def extra(self, steps: int) -> dict[str, float]:
         """Return what only this task measures, after ``steps`` control steps."""
-        return {"hurdles_passed": float(self.passed)} if self.task == "hurdles" else {}
+        return {"hurdles_passed": float(self.passed)} if self.task == HURDLES else {}
 
     def _rewards_front_feet(self) -> bool:
-        return self.task == "stand" and self.height_of == "front_feet"
+        return self.task == STAND and self.height_of == "front_feet"
 
     def _hurdles(self, qpos: np.ndarray, qvel: np.ndarray) -> float:
         """Return the hurdles reward and count the hurdles passed."""

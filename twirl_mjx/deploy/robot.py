@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 
 from twirl_mjx.deploy.conditions import CONTROL_HZ, RehearsalConfig
-from twirl_mjx.deploy.reference import FALL_PARTS, Reading, quaternion_matrix
+from twirl_mjx.deploy.reference import FALL_PARTS, IMITATE, Reading, quaternion_matrix
 
 LEGS = ("FR", "FL", "RR", "RL")
 POSE = np.tile([0.0, 0.9, -1.8], 4)
@@ -115,7 +115,7 @@ class Contacts:
         )
         self._band = np.array([name.startswith("hurdle_") for name in names])
         self._watched = self._fall | self._band
-        knees = range(model.nbody) if task == "imitate" else ()
+        knees = range(model.nbody) if task == IMITATE else ()
         self._knees = [i for i in knees if model.body(i).name.endswith("_calf")]
 
     def cause(self, data: mujoco.MjData) -> str | None:

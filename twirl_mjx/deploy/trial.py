@@ -19,7 +19,7 @@ from twirl_mjx.deploy.conditions import CONTROL_HZ, LIVE, RehearsalConfig
 from twirl_mjx.deploy.ground import build_model, ground_height, set_conditions
 from twirl_mjx.deploy.imitation import FollowScore
 from twirl_mjx.deploy.pilots import Pilot
-from twirl_mjx.deploy.reference import Reading, Score
+from twirl_mjx.deploy.reference import HURDLES, IMITATE, Reading, Score
 from twirl_mjx.deploy.robot import CommandFilter, Contacts, Sensors, motor_shares, motor_torque
 
 BANDS = 24
@@ -127,13 +127,13 @@ class Trial:
         Raises:
             ValueError: Ground on which the task is not rehearsed.
         """
-        if task == "imitate" and (config.bump_height or config.incline_deg):
+        if task == IMITATE and (config.bump_height or config.incline_deg):
             raise ValueError(
                 "task imitate is rehearsed on flat ground only (nearest: bump_height 0,"
                 " incline_deg 0)"
             )
         self.pilot, self.task, self.config = pilot, task, config
-        self.hurdles = draw_hurdles(config, rng) if task == "hurdles" else np.zeros(0)
+        self.hurdles = draw_hurdles(config, rng) if task == HURDLES else np.zeros(0)
         self._drawn = draw_goal(config, rng)
         self.model = build_model(config, self.hurdles)
         self.data = mujoco.MjData(self.model)
@@ -154,7 +154,7 @@ class Trial:
         """Why it ended: ``fall``, ``hurdle``, ``lost`` or ``diverged``; None while it goes on."""
 
     def _new_score(self) -> Score:
-        if self.task == "imitate":
+        if self.task == IMITATE:
             return FollowScore(
                 self.task, self.hurdles, clip=self.pilot.clip, options=self.pilot.options
             )
@@ -248,7 +248,7 @@ class Trial:
             "peak_torque": float(self.drive.peak.max()),
             "mean_power": float(self.drive.work.sum()) / seconds,
         }
-        if self.task == "imitate":  # it has no goal and nobody stands up
+        if self.task == IMITATE:  # it has no goal and nobody stands up
             for name in ("standing_time", "min_distance", "final_distance"):
                 del metrics[name]
         return metrics | score.extra(self.steps) | {"clipped": self._clipped / self.steps}

@@ -20,7 +20,7 @@ from twirl_mjx.checks import check_choice, check_range
 from twirl_mjx.deploy.conditions import CONTROL_HZ, LIVE, RANGES, SHIFTS, RehearsalConfig
 from twirl_mjx.deploy.ground import ground_height
 from twirl_mjx.deploy.pilots import find_pilot
-from twirl_mjx.deploy.reference import TASKS
+from twirl_mjx.deploy.reference import BIPED, HURDLES, IMITATE, STAND, TASKS
 from twirl_mjx.deploy.trial import BANDS, Trial
 from twirl_mjx.policies.learned import resolve_policy_path
 from twirl_mjx.policies.resolve import PLAIN, header_of
@@ -28,7 +28,7 @@ from twirl_mjx.sim.engine import silence
 from twirl_mjx.view.picture import Picture
 
 DT = 1.0 / CONTROL_HZ
-GOAL_TASKS = ("biped", "hurdles")
+GOAL_TASKS = (BIPED, HURDLES)
 """Tasks that show a goal."""
 PUSH_S = 0.2
 """s, how long a push lasts."""
@@ -63,10 +63,10 @@ SLIDERS = (
     Slider("latency_ms", "latency", 0.0, 100.0, 5.0, "ms"),
     Slider("noise", "noise", 0.0, 10.0, 0.5, "x"),
     Slider("torque_limit", "motor torque", 5.0, 40.0, 0.5, "N m"),
-    Slider("incline_deg", "hill", 0.0, 20.0, 1.0, "°", ("stand", "biped", "hurdles")),
-    Slider("bump_height", "bumps", 0.0, 0.1, 0.005, "m", ("stand", "biped")),
-    Slider("hurdle_gap", "hurdle gap", 1.0, 4.0, 0.1, "m", ("hurdles",)),
-    Slider("hurdle_height", "hurdle height", 0.005, 0.1, 0.005, "m", ("hurdles",)),
+    Slider("incline_deg", "hill", 0.0, 20.0, 1.0, "°", (STAND, BIPED, HURDLES)),
+    Slider("bump_height", "bumps", 0.0, 0.1, 0.005, "m", (STAND, BIPED)),
+    Slider("hurdle_gap", "hurdle gap", 1.0, 4.0, 0.1, "m", (HURDLES,)),
+    Slider("hurdle_height", "hurdle height", 0.005, 0.1, 0.005, "m", (HURDLES,)),
 )
 
 
@@ -190,7 +190,7 @@ class Stage:
         self._begin()
 
     def _aim(self, goal: Any) -> None:
-        if self._trial.task not in ("stand", "biped"):
+        if self._trial.task not in (STAND, BIPED):
             raise ValueError(f"the goal of task {self._trial.task} stays where it is")
         self._goal = np.array(_numbers("goal", goal, 2, MAX_GOAL))
         self._trial.aim(self._goal)
@@ -285,7 +285,7 @@ class Stage:
                 "paused": self._pause,
                 "poses": self._picture.poses(qpos).round(4).tolist(),
                 "goal": [*place.tolist(), height] if self._trial.task in GOAL_TASKS else None,
-                "goalMoves": self._trial.task == "biped",
+                "goalMoves": self._trial.task == BIPED,
                 "force": self._force.tolist(),
                 "values": readouts(trial),
                 "status": self._status(),
@@ -306,12 +306,12 @@ def readouts(trial: Trial) -> dict[str, float]:
     """Return what is read beside a picture of a trial: name with unit -> number, the main first."""
     score, qpos = trial.score, trial.data.qpos
     values: dict[str, float] = {}
-    if trial.task == "hurdles":
+    if trial.task == HURDLES:
         values["hurdles passed"] = score.passed
-    if trial.task == "biped":
+    if trial.task == BIPED:
         values["distance to goal (m)"] = score.previous_distance
         values["closest so far (m)"] = score.min_distance
-    if trial.task in ("stand", "biped"):
+    if trial.task in (STAND, BIPED):
         values["on hind legs (s)"] = score.standing_steps * DT
     values |= {
         "speed (m/s)": float(np.linalg.norm(trial.data.qvel[:2])),
@@ -331,7 +331,7 @@ def _age(policy: Any) -> str:
 
 def shifts_of(task: str) -> tuple[str, ...]:
     """Names of the shifts that a task can be rehearsed under."""
-    other = {"hurdles": ("bumpy",), "imitate": ("bumpy", "sloped")}.get(task, ())
+    other = {HURDLES: ("bumpy",), IMITATE: ("bumpy", "sloped")}.get(task, ())
     return tuple(name for name in SHIFTS if name not in other)
 
 
