@@ -195,7 +195,11 @@ def test_the_notebook_was_executed_and_is_small() -> None:
 def test_the_notebook_runs(tmp_path: Path) -> None:
     """Its code as it stands, but for a training of seconds; the film goes nowhere."""
     text = "\n".join("".join(cell["source"]) for cell in cells())
-    shown = "import sys, types; sys.modules['IPython.display'] = types.SimpleNamespace(Video=print)"
+    shown = (
+        "import sys, types\n"
+        "def video(path, **options): print(path)\n"
+        "sys.modules['IPython.display'] = types.SimpleNamespace(Video=video)"
+    )
     settings = re.compile(r'    preset="cpu",.*?    say=', re.S)
     short = settings.sub('    preset="debug",\n    say=', text)
     assert "total_env_steps" in text and "total_env_steps" not in short
