@@ -30,7 +30,7 @@ ALLOWED: dict[str, set[str]] = {
     "files": {"checks"},
     "array_files": {"files"},
     "faults": {"exits"},
-    "plugins": {"checks"},
+    "plugins": {"checks", "files"},
     "records": {"checks"},
     "sim": BASE,
     "motion": BASE | {"sim"},

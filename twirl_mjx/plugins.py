@@ -17,6 +17,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+from twirl_mjx import files
 from twirl_mjx.checks import check_choice, nearest
 
 
@@ -216,7 +217,7 @@ def _is_copy(reference: str, other: str) -> bool:
     if not is_reference(other):
         return False
     (path, name), (other_path, other_name) = split(reference), split(other)
-    return name == other_name and path.read_bytes() == other_path.read_bytes()
+    return name == other_name and files.checksum(path) == files.checksum(other_path)
 
 
 def _module_of(item: Any) -> str:

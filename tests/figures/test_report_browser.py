@@ -138,7 +138,7 @@ def test_the_report_opens_offline_in_both_colour_schemes(browser, report_file):
         seen[scheme] = result["result"]["value"]
 
     for page in seen.values():
-        assert len(page["images"]) == 6
+        assert len(page["images"]) == 5
         assert all(width > 0 for width, _ in page["images"]), page["images"]
         assert all(width > 0 and ready >= 2 for width, ready, _ in page["videos"]), page["videos"]
         assert page["overflow"] <= 0
