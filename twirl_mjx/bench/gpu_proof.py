@@ -207,7 +207,9 @@ def prove_parity(options: GpuProofBench, folder: Folder, deadline: float) -> Rec
             given = {**environment(), **platform}
             engines = parity.ENGINES[:1] if options.tiny else parity.ENGINES
             found.append(parity.write(folder.path / name, given, left, engines))
-    except (OSError, RuntimeError, subprocess.TimeoutExpired) as error:
+    except subprocess.TimeoutExpired as late:
+        return {"error": f"parity was not done in {late.timeout:.0f} s (--minutes)"}
+    except (OSError, RuntimeError) as error:
         return {"error": f"parity: {error}"}
     rows = [
         {"name": name, "error": error, "tolerance": parity.TOLERANCE[name.split(".")[0]]}
