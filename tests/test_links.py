@@ -38,3 +38,9 @@ def test_every_result_picture_is_shown() -> None:
     shown = {target.resolve() for page in PAGES for target in targets(page)}
     pictures = set((ROOT / "docs" / "images" / "results").glob("*.png"))
     assert pictures and pictures <= shown
+
+
+def test_the_front_page_stays_short() -> None:
+    lines = (ROOT / "README.md").read_text(encoding="utf-8").splitlines()
+    assert len(lines) <= 120
+    assert [line for line in lines if len(line) > 100] == []

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import re
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +12,10 @@ import pytest
 
 from twirl_mjx.commands import evaluate
 from twirl_mjx.commands.render import config_of, name_of
+from twirl_mjx.figures.tables import read_episodes
 from twirl_mjx.files import FileError
 from twirl_mjx.policies.learned import PolicyFileError, PolicyHeader, save_policy
+from twirl_mjx.tasks.registry import TASKS
 from twirl_mjx.training import rundir
 from twirl_mjx.training.presets import make_config
 from twirl_mjx.worlds.config import WorldConfig
@@ -48,8 +51,14 @@ def scored(monkeypatch: pytest.MonkeyPatch) -> list[WorldConfig]:
 def run(out: Path, *words: str) -> list[dict[str, str]]:
     fixed = ["--out", str(out), "--shifts", "none", "--episodes", "2"]
     assert evaluate.main([*words, *fixed]) == 0
-    with out.open(newline="") as file:
-        return list(csv.DictReader(file))
+    return read(out)
+
+
+def read(table: Path) -> list[dict[str, str]]:
+    """Return the rows below the note that holds the command."""
+    note, *lines = table.read_text().splitlines()
+    assert note.startswith("# command: .venv/bin/twirl evaluate ")
+    return list(csv.DictReader(lines))
 
 
 def test_a_bad_name_is_found_before_anything_is_scored(
@@ -85,8 +94,7 @@ def test_what_is_done_is_kept_when_a_later_policy_fails(
     assert out.read_text() == "of yesterday"
     with pytest.raises(RuntimeError, match="the third"):
         run(out, "trot", "zero", "bound", "--task", "stand", "--overwrite")
-    with out.open(newline="") as file:
-        rows = list(csv.DictReader(file))
+    rows = read(out)
     assert [row["run"] for row in rows] == ["trot", "trot", "zero", "zero"]
     assert sorted(path.name for path in tmp_path.iterdir()) == ["table.csv"]
 
@@ -110,6 +118,38 @@ def test_policies_that_the_table_cannot_tell_apart_are_refused(
     make_run(tmp_path / "c" / "a")
     with pytest.raises(ValueError, match="would both be 'a' in"):
         run(tmp_path / "table.csv", str(tmp_path / first), str(tmp_path / second))
+    assert not scored
+
+
+def test_a_policy_is_given_a_name_and_a_table_columns(
+    scored: list[WorldConfig], tmp_path: Path
+) -> None:
+    file = save(tmp_path / "stand.npz")
+    out = tmp_path / "table.csv"
+    words = [f"source={file}", f"again={file}", "zero", "--task", "stand"]
+    rows = run(out, *words, "--setting", "gap=2.4", "course=near by")
+    assert [row["run"] for row in rows] == ["source"] * 2 + ["again"] * 2 + ["zero"] * 2
+    assert {(row["gap"], row["course"]) for row in rows} == {("2.4", "near by")}
+    assert read_episodes(out).settings == ["gap", "course"]
+    (tmp_path / "odd=name.npz").write_bytes(Path(file).read_bytes())
+    assert run(out, str(tmp_path / "odd=name.npz"))[0]["run"] == "odd=name"
+    assert len(scored) == 4
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["gap"], "not name=value"),
+        (["2=4"], "not name=value"),
+        (["seed=4"], "has a column seed already"),
+        (["gap=1", "gap=2"], "has a column gap already"),
+    ],
+)
+def test_a_column_that_is_none_is_refused(
+    words: list[str], message: str, scored: list[WorldConfig], tmp_path: Path
+) -> None:
+    with pytest.raises(ValueError, match=message):
+        run(tmp_path / "table.csv", "zero", "--task", "stand", "--setting", *words)
     assert not scored
 
 
@@ -159,6 +199,26 @@ def test_tables_fit_into_80_columns(capsys: pytest.CaptureFixture[str]) -> None:
     heads = [word for line in lines for word in line.split() if word in shifts]
     assert heads == list(shifts)
     returns = [line.split()[1:] for line in lines if line.split()[:1] == ["return"]]
-    means = [cell for row in returns if row[0] != "IQM" for cell in row]
+    intervals = [line for line in lines if "return 95 %" in line]
+    means = [cell for row in returns if row[0] != "95" for cell in row]
     assert means == ["49.5"] * len(shifts)
+    assert 2 * len(intervals) == len(returns)
+    assert all(re.search(r"4[34]\.\d+, 5[45]\.\d+", line) for line in intervals)
     assert any("min_distance (median)" in line for line in lines)
+
+
+def test_hurdles_are_led_by_hurdles(capsys: pytest.CaptureFixture[str]) -> None:
+    found = {
+        "return": np.array([10.0, 20.0]),
+        "hurdles_passed": np.array([0.0, 4.0]),
+        "clean_clearances": np.array([0.0, 3.0]),
+        "fall": np.array([np.nan, np.nan]),
+    }
+    evaluate._print_table("hurdles", {"none": found}, TASKS.get("hurdles"))
+    rows = [line.split() for line in capsys.readouterr().out.splitlines() if line.strip()]
+    names = [row[0] for row in rows[3:]]
+    assert names[:3] == ["hurdles_passed", "hurdles_passed", "single_flight"]
+    cells = {row[0]: row[-1] for row in rows if len(row) == 2}
+    assert cells["hurdles_passed"] == "2"
+    assert cells["single_flight"] == "0.75"  # of the episode that passed any
+    assert "fall" not in names

@@ -127,3 +127,13 @@ def test_one_run_of_a_curve_has_no_interval(table_of):
     (cell,) = summary.summarise(table_of(rows("twirl", [5])), "return")
     assert cell.mean.over == ""
     assert math.isnan(cell.mean.low)
+
+
+def test_a_policy_that_does_nothing_may_be_measured_under_several_settings(table_of):
+    columns = (*tables.CURVE_COLUMNS, "course")
+    table = table_of(
+        rows("zero", [1], extra=("near",)), rows("zero", [3], extra=("far",)), columns=columns
+    )
+    found = {s.label: s.mean.estimate for s in summary.summarise(table, "return")}
+    assert found == {"course = near": 1.0, "course = far": 3.0}
+    assert all(s.is_idle for s in summary.summarise(table, "return"))

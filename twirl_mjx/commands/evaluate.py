@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
+import re
+import shlex
 import sys
 import time
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -20,8 +23,9 @@ from twirl_mjx.commands.console import say
 from twirl_mjx.commands.options import Overrides, parse_in_tasks, with_overrides
 from twirl_mjx.commands.render import config_of, name_of
 from twirl_mjx.evaluation.shifts import evaluate_shifts
-from twirl_mjx.figures.statistics import bootstrap
+from twirl_mjx.figures.statistics import bootstrap, mean
 from twirl_mjx.sim.dynamics import PAPER_SHIFTS, SHIFTS
+from twirl_mjx.tasks.task import Task
 from twirl_mjx.worlds.config import WorldConfig
 
 if TYPE_CHECKING:
@@ -41,7 +45,7 @@ class EvaluateOptions:
 
     policies: Annotated[tuple[str, ...], tyro.conf.Positional]
     """Run directories, policy files (.npz, .onnx), file.py:function or scripted names (trot, bound,
-    zero, random, clip)."""
+    zero, random, clip); NAME=POLICY gives it a name in the table, such as source=stand.npz."""
     task: str | None = None
     """Task to act in; the one a policy was trained for by default."""
     shifts: tuple[str, ...] = PAPER_SHIFTS
@@ -59,6 +63,8 @@ class EvaluateOptions:
     out: Path | None = None
     """Tidy table of every episode, replaced after every policy; by default
     runs/evaluation-DATE-TIME.csv."""
+    setting: tuple[str, ...] = ()
+    """Columns that tell this table from others beside it, as name=value: gap=2.4."""
     figure: Path | None = None
     """Also draw the returns as bars into this PNG file."""
     source_contract: str = ""
@@ -99,11 +105,13 @@ def main(argv: list[str]) -> int:
         raise ValueError(f"--shifts names {twice[0]} twice: once is enough")
     out = options.out or Path("runs", f"evaluation-{time.strftime('%Y%m%d-%H%M%S')}.csv")
     check_outputs(out, options.figure, options.overwrite)
+    settings = check_settings(options.setting)
     candidates = resolve_all(options, overrides)
+    notes = f"# command: {shlex.join(['.venv/bin/twirl', 'evaluate', *argv])}\n"
     rows: list[list[object]] = []
     for candidate in candidates:
         rows += _evaluate_one(candidate, options)
-        write_rows(out, rows)
+        write_rows(out, rows, notes, settings)
         say(f"wrote {out}: {len(rows):,} rows")
     if options.figure is not None:
         _draw(out, options.figure)
@@ -142,14 +150,14 @@ def resolve_all(options: EvaluateOptions, overrides: Overrides) -> list[Candidat
     from twirl_mjx.policies.resolve import PLAIN, Terms, resolve_policy, takes_terms
 
     terms = Terms(options.source_contract, options.source_command, options.allow_clipping)
-    foreign = [given for given in options.policies if terms != PLAIN and takes_terms(given)]
+    named = [_named(word) for word in options.policies]
+    foreign = [given for _, given in named if terms != PLAIN and takes_terms(given)]
     candidates: dict[str, Candidate] = {}
-    for given in options.policies:
-        run = name_of(given)
+    for run, given in named:
         if run in candidates:
             raise ValueError(
                 f"{candidates[run].given} and {given} would both be {run!r} in the table:"
-                " evaluate them one by one with --out, or copy one to another name"
+                f" give one another name (nearest: {run}_2={given})"
             )
         config = with_overrides(config_of(given, options.task), overrides)
         config = dataclasses.replace(config, course=options.course, engine=options.engine)
@@ -166,11 +174,42 @@ def resolve_all(options: EvaluateOptions, overrides: Overrides) -> list[Candidat
     return list(candidates.values())
 
 
-def write_rows(path: Path, rows: list[list[object]]) -> None:
-    """Write a table of episodes under its header, whole or not at all."""
+def _named(word: str) -> tuple[str, str]:
+    """Return what the table calls a policy and what loads it, of NAME=POLICY or POLICY."""
+    name, equals, given = word.partition("=")
+    if equals and re.fullmatch(r"[\w+-]+", name) and not Path(word).exists():
+        return name, given
+    return name_of(word), word
+
+
+def check_settings(words: tuple[str, ...]) -> dict[str, str]:
+    """Return the further columns of a table by name.
+
+    Raises:
+        ValueError: Not name=value, a name that the table has, or one given twice.
+    """
+    from twirl_mjx.figures.tables import RESERVED
+
+    settings: dict[str, str] = {}
+    for word in words:
+        name, _, value = (part.strip() for part in word.partition("="))
+        if not name.isidentifier() or not value:
+            raise ValueError(f"--setting {word!r} is not name=value (nearest: gap=2.4)")
+        if name in RESERVED or name in settings:
+            raise ValueError(f"--setting {word}: the table has a column {name} already")
+        settings[name] = value
+    return settings
+
+
+def write_rows(
+    path: Path, rows: list[list[object]], notes: str = "", settings: Mapping[str, str] | None = None
+) -> None:
+    """Write a table of episodes under notes and header, whole or not at all."""
     from twirl_mjx.training.rundir import EVAL_COLUMNS
 
-    files.write_csv(path, [EVAL_COLUMNS, *rows])
+    more = dict(settings or {})
+    table = ([*row, *more.values()] for row in rows)
+    files.write_csv(path, [[*EVAL_COLUMNS, *more], *table], notes)
 
 
 def _evaluate_one(candidate: Candidate, options: EvaluateOptions) -> list[list[object]]:
@@ -191,7 +230,7 @@ def _evaluate_one(candidate: Candidate, options: EvaluateOptions) -> list[list[o
         strength=options.strength,
     )
     wall = time.monotonic() - began
-    _print_table(f"{candidate.given} in {config.task}", values)
+    _print_table(f"{candidate.given} in {config.task}", values, config.task_type)
     say(f"took {wall:.1f} s, with compilation")
     card = getattr(getattr(found.loaded, "header", None), "card", {})
     variant = card.get("variant", "scripted") if found.loaded else "scripted"
@@ -205,44 +244,51 @@ def _evaluate_one(candidate: Candidate, options: EvaluateOptions) -> list[list[o
     ]
 
 
-def _print_table(title: str, values: dict[str, dict[str, np.ndarray]]) -> None:
-    """Print mean of every measure, and mean and IQM of the return with a 95 % interval.
+def _print_table(
+    title: str, values: dict[str, dict[str, np.ndarray]], task: type[Task] = Task
+) -> None:
+    """Print the mean of every measure; of those that lead the task first, with 95 % intervals.
 
     A row is a measure and a column a condition; conditions that do not fit stand below.
     """
     console = Console(width=None if sys.stdout.isatty() else 80)
-    columns = {shift: _cells(found) for shift, found in values.items()}
+    columns = {shift: _cells(found, task) for shift, found in values.items()}
     for shown in _that_fit(columns, console.width):
         table = Table(title=title, box=SIMPLE, padding=(0, 1))
         table.add_column("", overflow="fold")
         for shift in shown:
             table.add_column(shift, justify="right", no_wrap=True)
-        for row in columns[shown[0]]:
-            table.add_row(row, *(columns[shift][row] for shift in shown))
+        for row in dict.fromkeys(row for shift in shown for row in columns[shift]):
+            table.add_row(row, *(columns[shift].get(row, "") for shift in shown))
         console.print(table)
 
 
-def _cells(found: dict[str, np.ndarray]) -> dict[str, str]:
+def _cells(found: dict[str, np.ndarray], task: type[Task]) -> dict[str, str]:
     """Return the texts of one condition by the name of their row."""
-    iqm = bootstrap([found["return"]])
-    cells = {
-        "return": f"{found['return'].mean():.1f}",
-        "return IQM": f"{iqm.estimate:.1f}",
-        "  95 % from": f"{iqm.low:.1f}",
-        "  95 % to": f"{iqm.high:.1f}",
+    ratios = {
+        name: found[top][found[below] > 0] / found[below][found[below] > 0]
+        for name, (top, below) in task.ratios.items()
+        if top in found
     }
-    for name in found:
+    every = found | ratios
+    cells: dict[str, str] = {}
+    for name in dict.fromkeys((*(n for n in task.lead if n in every), "return", *every)):
+        values = every[name][~np.isnan(every[name])]
         if name in MEDIANS:
-            cells[f"{name} (median)"] = f"{np.nanmedian(found[name]):.3g}"
-        elif name != "return":
-            cells[name] = f"{np.nanmean(found[name]):.3g}"
+            cells[f"{name} (median)"] = f"{np.median(values):.3g}" if len(values) else ""
+        if not len(values):
+            continue
+        cells[name] = f"{values.mean():.4g}"
+        if name in task.lead and len(values) > 1:
+            found_interval = bootstrap([values], mean)
+            cells[f"  {name} 95 %"] = f"{found_interval.low:.4g}, {found_interval.high:.4g}"
     return cells
 
 
 def _that_fit(columns: dict[str, dict[str, str]], width: int) -> list[list[str]]:
     """Return the conditions in groups whose columns fit into a width in characters, with gaps."""
     gap = 3
-    rows = max(map(len, next(iter(columns.values())))) + gap
+    rows = max(len(row) for cells in columns.values() for row in cells) + gap
     groups: list[list[str]] = []
     room = 0
     for shift, cells in columns.items():

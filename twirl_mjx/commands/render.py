@@ -29,7 +29,7 @@ MAX_PANELS = 1000
 
 @dataclasses.dataclass(frozen=True)
 class RenderOptions:
-    """Film one episode of a policy: an mp4 and a strip of frames, without a display."""
+    """Film one episode of a policy, without a display: a film and a strip of frames."""
 
     policy: Annotated[str, tyro.conf.Positional]
     """Run directory, policy file (.npz, .onnx), file.py:function or scripted name."""
@@ -44,8 +44,8 @@ class RenderOptions:
     panels: int = 8
     """Frames in the strip."""
     out: Path | None = None
-    """Path of mp4 and strip, with or without their ending; <run>/episode, or
-    runs/<policy>-<task>, by default."""
+    """Name of the film: x.mp4, x.webp (an animated picture), or without ending for mp4; the strip
+    lies beside it as png. <run>/episode, or runs/<policy>-<task>, by default."""
     source_contract: str = ""
     """How a foreign policy meets the robot, by name or file (docs/sources.md)."""
     source_command: str = ""
@@ -113,12 +113,14 @@ def check_film(stem: Path, options: RenderOptions) -> None:
     Raises:
         FileError: One of them is there and was not written by this project.
     """
-    for ending in (".mp4", ".png"):
-        files.check_ours(stem.parent / f"{stem.name}{ending}", overwrite=options.overwrite)
+    from twirl_mjx.deploy.video import film_paths
+
+    for path in film_paths(stem):
+        files.check_ours(path, overwrite=options.overwrite)
 
 
 def film(config: WorldConfig, recording: Recording, stem: Path, options: RenderOptions) -> Path:
-    """Write ``<stem>.mp4`` and ``<stem>.png``; return the strip's path.
+    """Write the film and its strip, as ``render_episode`` names them; return the strip's path.
 
     Raises:
         FileError: As :func:`check_film`.

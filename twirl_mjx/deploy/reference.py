@@ -29,7 +29,7 @@ FALL_PARTS = {
     HURDLES: ("trunk", "head"),
     IMITATE: ("trunk", "head", "hip", "thigh"),
 }
-"""Parts of the robot whose ground contact ends an episode (README, "Deviations and decisions")."""
+"""Parts of the robot whose ground contact ends an episode (docs/decisions.md)."""
 
 
 class Reading(NamedTuple):

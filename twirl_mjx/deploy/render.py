@@ -2,28 +2,49 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import mujoco
 import numpy as np
 
-from twirl_mjx.deploy.video import overlay_text, strip_indices, write_strip, write_video
+from twirl_mjx.deploy.video import (
+    film_paths,
+    overlay_text,
+    strip_indices,
+    write_strip,
+    write_video,
+)
 from twirl_mjx.sim.draw import CameraView, SceneRenderer
 
+GOAL_MARGIN = 1.2
+"""m, camera distance when the robot is at its goal."""
+GOAL_SHARE = 0.9
+"""m of camera distance for every m between robot and goal: both are then in the picture."""
 
-def look_at_path(qpos: np.ndarray, view: CameraView, frame_dt: float) -> np.ndarray:
-    """Return the smoothed path [T, 3] m of the look-at point.
 
-    A first-order low-pass is run forwards and backwards, so the camera does not lag.
+def camera_path(
+    qpos: np.ndarray, view: CameraView, frame_dt: float, goals: np.ndarray | None = None
+) -> np.ndarray:
+    """Return the smoothed path [T, 4] m of look-at point and camera distance.
+
+    The camera looks at the robot, or half way to its goal from so far back that both are seen.
+    A first-order low-pass is run forwards and backwards, so it does not lag.
 
     Args:
         qpos: [T, 7 + J].
         view: camera.
         frame_dt: time between frames, s.
+        goals: [T, 2 or 3] m, goal per frame; ``None`` for none.
     """
-    path = np.column_stack([qpos[:, :2], np.full(len(qpos), view.height)])
-    path[:, 2] = np.maximum(path[:, 2], 0.6 * qpos[:, 2])
+    heights = np.maximum(view.height, 0.6 * qpos[:, 2])
+    path = np.column_stack([qpos[:, :2], heights, np.full(len(qpos), view.distance)])
+    if goals is not None:
+        way = np.asarray(goals)[:, :2] - qpos[:, :2]
+        path[:, :2] += 0.5 * way
+        apart = GOAL_MARGIN + GOAL_SHARE * np.linalg.norm(way, axis=1)
+        path[:, 3] = np.maximum(path[:, 3], apart)
     keep = np.exp(-frame_dt / view.smoothing_s) if view.smoothing_s > 0 else 0.0
     for order in (slice(None), slice(None, None, -1)):
         points = path[order]
@@ -69,10 +90,11 @@ def render_frames(
         if values is not None and len(values) != len(qpos):
             raise ValueError(f"{len(values)} {name} for {len(qpos)} frames")
     view = view or CameraView()
-    path = look_at_path(qpos, view, frame_dt)
+    path = camera_path(qpos, view, frame_dt, goals)
     with SceneRenderer(model, *size, antialias=antialias) as renderer:
         for i, state in enumerate(qpos):
-            frame = renderer.draw(state, view, path[i], None if goals is None else goals[i])
+            seen = dataclasses.replace(view, distance=float(path[i, 3]))
+            frame = renderer.draw(state, seen, path[i, :3], None if goals is None else goals[i])
             yield frame if captions is None else overlay_text(frame, captions[i])
 
 
@@ -90,6 +112,8 @@ def render_episode(
     antialias: bool = False,
 ) -> tuple[Path, Path]:
     """Write ``<stem>.mp4`` and ``<stem>.png``, a strip of ``panels`` frames, in one pass.
+
+    A ``stem`` that ends as a film does (``FILMS``) is the name of the film itself.
 
     Args and raises: as ``render_frames``.
 
@@ -116,5 +140,5 @@ def render_episode(
                 kept.append(frame)
             yield frame
 
-    video_path = write_video(stem.parent / f"{stem.name}.mp4", watched(), round(1.0 / frame_dt))
-    return video_path, write_strip(stem.parent / f"{stem.name}.png", kept)
+    film, strip = film_paths(stem)
+    return write_video(film, watched(), round(1.0 / frame_dt)), write_strip(strip, kept)

@@ -15,7 +15,10 @@ from twirl_mjx import files
 
 
 def overlay_text(frame: np.ndarray, lines: Sequence[str]) -> np.ndarray:
-    """Return ``frame`` [H, W, 3] with lines of text on a translucent box, top left."""
+    """Return ``frame`` [H, W, 3] with lines of text on a translucent box, bottom left.
+
+    The robot stands in the middle and reaches up when it stands on its hind legs.
+    """
     from PIL import Image, ImageDraw
 
     font = _font(max(frame.shape[0] // 26, 10))
@@ -23,11 +26,14 @@ def overlay_text(frame: np.ndarray, lines: Sequence[str]) -> np.ndarray:
     layer = Image.new("RGBA", image.size, (0, 0, 0, 0))
     draw = ImageDraw.Draw(layer)
     text, pad = "\n".join(lines), max(frame.shape[0] // 60, 4)
-    box = draw.multiline_textbbox((2 * pad, 2 * pad), text, font=font)
+    box = draw.multiline_textbbox((2 * pad, 0), text, font=font)
+    top = frame.shape[0] - 2 * pad - box[3]
     draw.rounded_rectangle(
-        (pad, pad, box[2] + pad, box[3] + pad), radius=pad, fill=(20, 24, 32, 150)
+        (pad, top + box[1] - pad, box[2] + pad, frame.shape[0] - pad),
+        radius=pad,
+        fill=(20, 24, 32, 150),
     )
-    draw.multiline_text((2 * pad, 2 * pad), text, font=font, fill=(255, 255, 255, 255))
+    draw.multiline_text((2 * pad, top), text, font=font, fill=(255, 255, 255, 255))
     return np.asarray(Image.alpha_composite(image, layer).convert("RGB"))
 
 
@@ -40,13 +46,27 @@ def _font(size: int) -> Any:
     return ImageFont.truetype(str(path), size)
 
 
-def write_video(path: str | Path, frames: Iterable[np.ndarray], fps: int = 20) -> Path:
-    """Write frames [H, W, 3] uint8 as H.264 (yuv420p) in an ``.mp4`` that any browser plays.
+FILMS = (".mp4", ".webp")
+"""Endings of films: H.264 (yuv420p), and an animated picture that pages show by themselves."""
+WEBP_QUALITY = 45
+"""0 to 100; a film of 8 s at 640 x 480 then takes about 1 MB."""
 
-    The encoder is started without ``fork``, which a process that runs jax must not use.
+
+def film_paths(stem: str | Path) -> tuple[Path, Path]:
+    """Return where a film and its strip go: a stem that ends as a film does is the film itself."""
+    stem = Path(stem)
+    film = stem if stem.suffix in FILMS else stem.parent / f"{stem.name}.mp4"
+    return film, film.parent / f"{film.stem}.png"
+
+
+def write_video(path: str | Path, frames: Iterable[np.ndarray], fps: int = 20) -> Path:
+    """Write frames [H, W, 3] uint8 as a film that any browser plays.
+
+    The encoder of ``.mp4`` is started without ``fork``, which a process that runs jax must not
+    use.
 
     Args:
-        path: target, ending in ``.mp4``; it is written whole or not at all.
+        path: target, ending in one of ``FILMS``; it is written whole or not at all.
         frames: pictures of one even size.
         fps: pictures per second.
 
@@ -55,8 +75,8 @@ def write_video(path: str | Path, frames: Iterable[np.ndarray], fps: int = 20) -
         RuntimeError: the encoder failed; the message holds its own.
     """
     path = Path(path)
-    if path.suffix != ".mp4":
-        raise ValueError(f"{path}: a video file ends in .mp4, got {path.suffix!r}")
+    if path.suffix not in FILMS:
+        raise ValueError(f"{path}: a video file ends in {' or '.join(FILMS)}, got {path.suffix!r}")
     pictures = iter(frames)
     first = next(pictures, None)
     if first is None:
@@ -64,6 +84,8 @@ def write_video(path: str | Path, frames: Iterable[np.ndarray], fps: int = 20) -
     height, width = first.shape[:2]
     if height % 2 or width % 2:
         raise ValueError(f"video frames need an even size, got {width} x {height}")
+    if path.suffix == ".webp":
+        return _write_webp(path, itertools.chain([first], pictures), fps)
     with files.replacing(path) as temporary:
         encoder = _start_encoder(temporary, width, height, fps)
         try:
@@ -72,6 +94,27 @@ def write_video(path: str | Path, frames: Iterable[np.ndarray], fps: int = 20) -
             encoder.kill()
             encoder.communicate()
             raise
+    return path
+
+
+def _write_webp(path: Path, frames: Iterable[np.ndarray], fps: int) -> Path:
+    """Write an animated WebP that repeats for ever."""
+    from PIL import Image
+
+    first, *others = (Image.fromarray(np.asarray(frame, np.uint8)) for frame in frames)
+    if sizes := {image.size for image in others} - {first.size}:
+        raise ValueError(f"video frames change size from {first.size} to {sizes.pop()}")
+    with files.write_atomic(path) as file:
+        first.save(
+            file,
+            "webp",
+            save_all=True,
+            append_images=others,
+            duration=round(1000 / fps),
+            loop=0,
+            quality=WEBP_QUALITY,
+            xmp=files.MARK.encode(),
+        )
     return path
 
 

@@ -56,14 +56,14 @@ def labelled(table: Table) -> Table:
     """Return the table with a column that names what a line, bar or row stands for.
 
     The name holds the settings, and the variant where several have settings or there are none; of
-    a policy that learns nothing it is its name.
+    a policy that learns nothing it is its name, with the settings that it has.
     """
     idle = is_idle(table)
     columns = ["variant", *table.settings]
     words = [table[column].tolist() for column in columns]
     idlers = np.where(np.isin(table["run"], DOES_NOTHING), table["run"], table["variant"])
     cells = [
-        (idlers[i], *[""] * (len(columns) - 1)) if idle[i] else cell
+        (idlers[i], *cell[1:]) if idle[i] else cell
         for i, cell in enumerate(zip(*words, strict=True))
     ]
     several = len({cell[0] for cell in cells if any(cell[1:])}) > 1

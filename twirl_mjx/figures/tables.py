@@ -64,6 +64,8 @@ _COUNTS = ("seed", "env_steps", "grad_steps", "episode")
 _NUMBERS = ("wall_s", "value")
 _ADDED = (ARM_COLUMN, LABEL_COLUMN)
 _STANDARD = {*CURVE_COLUMNS, *EPISODE_COLUMNS}
+RESERVED = frozenset({*_STANDARD, *_ADDED})
+"""Columns that cannot be a setting."""
 
 
 @dataclass(frozen=True)
@@ -108,7 +110,7 @@ class Table:
     @property
     def settings(self) -> list[str]:
         """Columns of settings, in the order of the file."""
-        return [name for name in self.columns if name not in {*_STANDARD, *_ADDED}]
+        return [name for name in self.columns if name not in RESERVED]
 
 
 def read_table(path: str | Path) -> Table:

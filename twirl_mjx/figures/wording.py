@@ -39,7 +39,7 @@ def interval_text(interval: Interval) -> str:
 def numbers(*values: float) -> list[str]:
     """Write numbers with the digits that suit the largest; NaN is a dash."""
     size = max((abs(value) for value in values if not np.isnan(value)), default=0.0)
-    digits = 0 if size >= 100 else 1 if size >= 10 else 2
+    digits = 0 if size >= 100 else 1 if size >= 10 else 3 if 0 < size < 0.1 else 2
     return ["\N{EN DASH}" if np.isnan(value) else f"{value:,.{digits}f}" for value in values]
 
 

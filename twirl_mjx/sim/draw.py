@@ -26,8 +26,8 @@ GOAL_RGBA = (0.10, 0.65, 0.25, 0.9)
 class CameraView:
     """A camera that follows the base."""
 
-    distance: float = 1.7
-    """Distance from the look-at point, m."""
+    distance: float = 2.1
+    """Distance from the look-at point, m; more where robot and goal are far apart."""
     azimuth: float = 120.0
     """Direction of view about world z, deg; 90 looks along +y, so +x is to the right."""
     elevation: float = -14.0

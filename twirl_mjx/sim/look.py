@@ -77,7 +77,10 @@ def _add_checker(spec: mujoco.MjSpec, name: str, rgb1: list[float], rgb2: list[f
         width=256,
         height=256,
     )
-    material = spec.add_material(name=name, texrepeat=[2, 2], texuniform=True, reflectance=0.05)
+    # Without a highlight: on a plane it is lit by the corners and flickers as the camera moves.
+    material = spec.add_material(
+        name=name, texrepeat=[2, 2], texuniform=True, reflectance=0.05, specular=0.0
+    )
     material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = name
 
 

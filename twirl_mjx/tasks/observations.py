@@ -32,7 +32,7 @@ class Entry(NamedTuple):
 
 
 def frame_layout(robot: Robot) -> tuple[Entry, ...]:
-    """Return one step of the proprioceptive history (paper appendix; README, deviations)."""
+    """Return one step of the proprioceptive history (paper appendix; docs/decisions.md)."""
     return (
         Entry("roll_pitch", 2, "rad", 0.01),
         Entry("roll_pitch_rate_b", 2, "rad/s", 0.05),

@@ -49,7 +49,7 @@ class StandOptions(GoalOptions):
     """Task ``stand``: get up on the hind legs."""
 
     height_of: Literal["root", "front_feet"] = "root"
-    """Which height r_height rewards: the root's or the front feet's mean (README, deviations)."""
+    """Which height r_height rewards: the root's or the front feet's mean (docs/decisions.md)."""
     risen_fraction: float = 0.0
     """Share of episodes started part-way up on the hind legs, at pitch U(0, 83 deg)."""
 

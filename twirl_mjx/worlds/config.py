@@ -61,7 +61,7 @@ class WorldConfig:
     randomize: tuple[str, ...] = ()
     """Physical parameters drawn for every world and episode: leaf=low:high, friction=0.4:1.25."""
     course: Literal["auto", "random", "fixed"] = "auto"
-    """Goals and hurdles; auto is random without a shift, fixed under one (README, deviations)."""
+    """Goals and hurdles; auto is random without a shift, fixed under one (docs/decisions.md)."""
     num_envs: int = 16
     """Worlds stepped together."""
     episode_length: int = 400
