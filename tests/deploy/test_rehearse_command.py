@@ -27,15 +27,21 @@ def run(*words: str) -> int:
 def test_table_csv_and_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     policy = str(asset_path("policies", "biped.npz"))
     for name in ("r.csv", "r.json"):
-        assert run(policy, "--episodes", "3", "--out", str(tmp_path / name)) == 0
+        settings = ["--setting", "latency_ms=15"] if name == "r.csv" else []
+        words = [f"walker={policy}", "--episodes", "3", *settings, "--out", str(tmp_path / name)]
+        assert run(*words) == 0
     printed = capsys.readouterr().out
     assert "3 episodes" in printed
     assert "95 % from" in printed
-    with (tmp_path / "r.csv").open() as file:
-        rows = list(csv.DictReader(file))
+    notes, *lines = (tmp_path / "r.csv").read_text().splitlines()
+    assert notes.startswith("# command: .venv/bin/twirl rehearse walker=")
+    rows = list(csv.DictReader(lines))
     assert {row["episode"] for row in rows} == {"0", "1", "2"}
+    assert {(row["run"], row["variant"], row["latency_ms"]) for row in rows} == {
+        ("walker", "twirl+weights", "15")
+    }
+    assert {"success", "fall", "standing_time"} <= {row["metric"] for row in rows}
     power = [float(row["value"]) for row in rows if row["metric"] == "mean_power"]
-    assert {row["unit"] for row in rows if row["metric"] == "mean_power"} == {"W"}
     record = json.loads((tmp_path / "r.json").read_text())
     line = next(row for row in record["table"] if row["metric"] == "mean_power")
     assert line["mean"] == pytest.approx(np.mean(power), rel=1e-6)

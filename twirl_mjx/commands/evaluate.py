@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-import re
 import shlex
 import sys
 import time
-from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -21,7 +19,8 @@ from twirl_mjx import files
 from twirl_mjx.checks import check_range
 from twirl_mjx.commands.console import say
 from twirl_mjx.commands.options import Overrides, parse_in_tasks, with_overrides
-from twirl_mjx.commands.render import config_of, name_of
+from twirl_mjx.commands.render import config_of
+from twirl_mjx.commands.tables import check_settings, named, write_rows
 from twirl_mjx.evaluation.shifts import evaluate_shifts
 from twirl_mjx.figures.statistics import bootstrap, mean
 from twirl_mjx.sim.dynamics import PAPER_SHIFTS, SHIFTS
@@ -150,10 +149,10 @@ def resolve_all(options: EvaluateOptions, overrides: Overrides) -> list[Candidat
     from twirl_mjx.policies.resolve import PLAIN, Terms, resolve_policy, takes_terms
 
     terms = Terms(options.source_contract, options.source_command, options.allow_clipping)
-    named = [_named(word) for word in options.policies]
-    foreign = [given for _, given in named if terms != PLAIN and takes_terms(given)]
+    pairs = [named(word) for word in options.policies]
+    foreign = [given for _, given in pairs if terms != PLAIN and takes_terms(given)]
     candidates: dict[str, Candidate] = {}
-    for run, given in named:
+    for run, given in pairs:
         if run in candidates:
             raise ValueError(
                 f"{candidates[run].given} and {given} would both be {run!r} in the table:"
@@ -172,44 +171,6 @@ def resolve_all(options: EvaluateOptions, overrides: Overrides) -> list[Candidat
             say(f"{given}: {note}")
         candidates[run] = Candidate(given, run, config, found)
     return list(candidates.values())
-
-
-def _named(word: str) -> tuple[str, str]:
-    """Return what the table calls a policy and what loads it, of NAME=POLICY or POLICY."""
-    name, equals, given = word.partition("=")
-    if equals and re.fullmatch(r"[\w+-]+", name) and not Path(word).exists():
-        return name, given
-    return name_of(word), word
-
-
-def check_settings(words: tuple[str, ...]) -> dict[str, str]:
-    """Return the further columns of a table by name.
-
-    Raises:
-        ValueError: Not name=value, a name that the table has, or one given twice.
-    """
-    from twirl_mjx.figures.tables import RESERVED
-
-    settings: dict[str, str] = {}
-    for word in words:
-        name, _, value = (part.strip() for part in word.partition("="))
-        if not name.isidentifier() or not value:
-            raise ValueError(f"--setting {word!r} is not name=value (nearest: gap=2.4)")
-        if name in RESERVED or name in settings:
-            raise ValueError(f"--setting {word}: the table has a column {name} already")
-        settings[name] = value
-    return settings
-
-
-def write_rows(
-    path: Path, rows: list[list[object]], notes: str = "", settings: Mapping[str, str] | None = None
-) -> None:
-    """Write a table of episodes under notes and header, whole or not at all."""
-    from twirl_mjx.training.rundir import EVAL_COLUMNS
-
-    more = dict(settings or {})
-    table = ([*row, *more.values()] for row in rows)
-    files.write_csv(path, [[*EVAL_COLUMNS, *more], *table], notes)
 
 
 def _evaluate_one(candidate: Candidate, options: EvaluateOptions) -> list[list[object]]:

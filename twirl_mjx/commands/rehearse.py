@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import shlex
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -13,13 +14,12 @@ import tyro
 from twirl_mjx import files
 from twirl_mjx.checks import check_range
 from twirl_mjx.commands.console import json_text, say
+from twirl_mjx.commands.tables import check_settings, named, write_rows
 from twirl_mjx.deploy.conditions import RehearsalConfig
 
 if TYPE_CHECKING:
     from twirl_mjx.deploy.rehearsal import Rehearsal
 
-COLUMNS = ("policy", "task", "episode", "ended", "metric", "unit", "value")
-"""Of the CSV table."""
 FORMAT = "twirl_mjx rehearsal"
 """What the JSON file says that it is."""
 
@@ -32,7 +32,8 @@ class RehearseOptions:
     """
 
     policy: Annotated[str, tyro.conf.Positional]
-    """Run directory, policy file (.npz, .onnx), file.py:function or scripted name."""
+    """Run directory, policy file (.npz, .onnx), file.py:function or scripted name; NAME=POLICY
+    gives it another name in the table."""
     task: str | None = None
     """Task; the one the policy was trained for by default."""
     episodes: int = 8
@@ -48,7 +49,9 @@ class RehearseOptions:
     allow_clipping: bool = False
     """Rehearse a foreign policy without a contract although its outputs leave [-1, 1]."""
     out: Path | None = None
-    """Every metric of every episode, as .json or .csv."""
+    """Every metric of every episode: .csv, a table as evaluate writes it, or .json."""
+    setting: tuple[str, ...] = ()
+    """Columns that tell the .csv from others beside it, as name=value: latency_ms=15."""
     film: Path | None = None
     """Film of the first episode, .mp4, with a strip of frames beside it."""
     overwrite: bool = False
@@ -71,20 +74,28 @@ def main(argv: list[str], set_up: Callable[[bool], None]) -> int:
     options, overrides = parse_in_tasks(RehearseOptions, argv, "twirl rehearse")
     check_range("episodes", options.episodes, 1, 100_000)
     check_range("seed", options.seed, 0, 2**32 - 1)
+    run, policy = named(options.policy)
+    settings = check_settings(options.setting)
+    if settings and (options.out is None or options.out.suffix != ".csv"):
+        raise ValueError("--setting is a column of a table (nearest: --out rehearsal.csv)")
     check_targets(options.out, options.film, options.overwrite)
     result = rehearse(
-        options.policy,
+        policy,
         task=options.task,
         episodes=options.episodes,
         seed=options.seed,
         config=options.robot,
-        options=_options_of(options.policy, options.task, overrides),
+        options=_options_of(policy, options.task, overrides),
         terms=Terms(options.source_contract, options.source_command, options.allow_clipping),
         say=say,
     )
-    print_table(options.policy, result)
+    print_table(policy, result)
+    if options.out is not None and options.out.suffix == ".csv":
+        notes = f"# command: {shlex.join(['.venv/bin/twirl', 'rehearse', *argv])}\n"
+        write_rows(options.out, rows_of(run, policy, result), notes, settings)
+    elif options.out is not None:
+        write(options.out, policy, result)
     if options.out is not None:
-        write(options.out, options.policy, result)
         say(f"wrote {options.out}")
     if options.film is not None:
         say(f"wrote {', '.join(map(str, film(options.film, result)))}")
@@ -97,13 +108,15 @@ def check_targets(out: Path | None, film: Path | None, overwrite: bool) -> None:
     Raises:
         ValueError: Another ending than is written, or a file that this command did not write.
     """
+    from twirl_mjx.training.rundir import EVAL_COLUMNS
+
     if out is not None:
         if out.suffix not in (".json", ".csv"):
             raise ValueError(
                 f"--out {out} ends in {out.suffix!r}, need .json or .csv (nearest:"
                 f" {out.with_suffix('.csv')})"
             )
-        mark = ",".join(COLUMNS) if out.suffix == ".csv" else FORMAT
+        mark = ",".join(EVAL_COLUMNS) if out.suffix == ".csv" else FORMAT
         files.check_ours(out, mark, overwrite=overwrite)
     if film is not None:
         if film.suffix != ".mp4":
@@ -150,17 +163,23 @@ def print_table(policy: str, result: Rehearsal) -> None:
     Console(width=None if sys.stdout.isatty() else 80).print(table)
 
 
+def rows_of(run: str, policy: str, result: Rehearsal) -> list[list[object]]:
+    """Return the cells of ``EVAL_COLUMNS``: every metric of every episode that is defined."""
+    from twirl_mjx.policies.resolve import header_of
+
+    header = header_of(policy)
+    card = header.card if header else {}
+    trained = [card.get("variant", "scripted"), card.get("seed", 0), card.get("env_steps", 0)]
+    return [
+        [run, result.task, "none", *trained, index, name, f"{value:.9g}"]
+        for index, episode in enumerate(result.episodes)
+        for name, value in episode.metrics.items()
+        if value == value
+    ]
+
+
 def write(path: Path, policy: str, result: Rehearsal) -> None:
-    """Write every metric of every episode, whole or not at all."""
-    units = {row.metric: row.unit for row in result.table()}
-    if path.suffix == ".csv":
-        rows = [
-            [policy, result.task, index, episode.cause, name, units[name], f"{value:.9g}"]
-            for index, episode in enumerate(result.episodes)
-            for name, value in episode.metrics.items()
-        ]
-        files.write_csv(path, [COLUMNS, *rows])
-        return
+    """Write the table and every metric of every episode as JSON, whole or not at all."""
     record = {
         "format": FORMAT,
         "policy": policy,

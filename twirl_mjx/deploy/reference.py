@@ -7,6 +7,7 @@ as a difference between a rehearsal and an evaluation (and in a test that compar
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -30,6 +31,20 @@ FALL_PARTS = {
     IMITATE: ("trunk", "head", "hip", "thigh"),
 }
 """Parts of the robot whose ground contact ends an episode (docs/decisions.md)."""
+
+
+NEAR, UPRIGHT, BANDS, LEAPS = 0.14, 12.0, 2, 3
+"""What makes an episode a success: m from the goal, s upright, hurdles passed, leaps flown."""
+
+
+def succeeded(task: str, metrics: Mapping[str, float]) -> bool:
+    """Return whether an episode with these metrics met its task's criterion."""
+    if task == HURDLES:
+        return metrics["hurdles_passed"] >= BANDS
+    if task == IMITATE:
+        return metrics["flights"] >= LEAPS
+    near = task == STAND or metrics["min_distance"] <= NEAR
+    return near and metrics["standing_time"] >= UPRIGHT
 
 
 class Reading(NamedTuple):

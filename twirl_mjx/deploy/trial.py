@@ -19,7 +19,7 @@ from twirl_mjx.deploy.conditions import CONTROL_HZ, LIVE, RehearsalConfig
 from twirl_mjx.deploy.ground import build_model, ground_height, set_conditions
 from twirl_mjx.deploy.imitation import FollowScore
 from twirl_mjx.deploy.pilots import Pilot
-from twirl_mjx.deploy.reference import HURDLES, IMITATE, Reading, Score
+from twirl_mjx.deploy.reference import HURDLES, IMITATE, Reading, Score, succeeded
 from twirl_mjx.deploy.robot import CommandFilter, Contacts, Sensors, motor_shares, motor_torque
 
 BANDS = 24
@@ -251,4 +251,8 @@ class Trial:
         if self.task == IMITATE:  # it has no goal and nobody stands up
             for name in ("standing_time", "min_distance", "final_distance"):
                 del metrics[name]
-        return metrics | score.extra(self.steps) | {"clipped": self._clipped / self.steps}
+        if self.task == HURDLES:
+            metrics["hit_hurdle"] = float(self.cause == "hurdle")
+        metrics |= {"fall": float(self.cause == "fall"), "clipped": self._clipped / self.steps}
+        metrics |= score.extra(self.steps)
+        return metrics | {"success": float(succeeded(self.task, metrics))}

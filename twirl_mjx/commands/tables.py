@@ -1,0 +1,49 @@
+"""Tables of episodes that commands write: whose rows, which further columns."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from pathlib import Path
+
+from twirl_mjx import files
+
+
+def named(word: str) -> tuple[str, str]:
+    """Return what the table calls a policy and what loads it, of NAME=POLICY or POLICY."""
+    from twirl_mjx.commands.render import name_of
+
+    name, equals, given = word.partition("=")
+    if equals and re.fullmatch(r"[\w+-]+", name) and not Path(word).exists():
+        return name, given
+    return name_of(word), word
+
+
+def check_settings(words: tuple[str, ...]) -> dict[str, str]:
+    """Return the further columns of a table by name.
+
+    Raises:
+        ValueError: Not name=value, a name that the table has, or one given twice.
+    """
+    from twirl_mjx.figures.tables import RESERVED
+
+    settings: dict[str, str] = {}
+    for word in words:
+        name, _, value = (part.strip() for part in word.partition("="))
+        if not name.isidentifier() or not value:
+            raise ValueError(f"--setting {word!r} is not name=value (nearest: gap=2.4)")
+        if name in RESERVED or name in settings:
+            raise ValueError(f"--setting {word}: the table has a column {name} already")
+        settings[name] = value
+    return settings
+
+
+def write_rows(
+    path: Path, rows: list[list[object]], notes: str = "", settings: Mapping[str, str] | None = None
+) -> None:
+    """Write a table of episodes under notes and header, whole or not at all."""
+    from twirl_mjx.training.rundir import EVAL_COLUMNS
+
+    more = dict(settings or {})
+    table = ([*row, *more.values()] for row in rows)
+    files.write_csv(path, [[*EVAL_COLUMNS, *more], *table], notes)
