@@ -254,6 +254,7 @@ def test_a_task_may_not_be_called_like_a_part_of_the_config(tmp_path: Path) -> N
         make_config(f"{path}:Eval", "debug")
 
 
+@pytest.mark.slow
 def test_a_source_object_from_python(tmp_path: Path) -> None:
     from twirl_mjx.policies.scripted import get_scripted
 

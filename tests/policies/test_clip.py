@@ -65,6 +65,7 @@ def test_it_plays_the_planned_actions_and_starts_anew_in_a_new_episode(policy: C
     np.testing.assert_allclose(action, planned[[(4 + steps - 5) % steps, 10]], atol=1e-6)
 
 
+@pytest.mark.slow
 def test_it_tracks_better_than_chance_but_not_for_long() -> None:
     config = make_config("imitate", "cpu")
     env = make_env(config.evaluation, num_envs=24, threads=1)

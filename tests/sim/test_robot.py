@@ -132,6 +132,7 @@ def play(robot: Robot, engine: Any, steps: int, action: np.ndarray) -> np.ndarra
     return np.array(rows)
 
 
+@pytest.mark.slow
 def test_c_and_mjx_agree_over_twenty_control_steps(made: Robot) -> None:
     action = 0.1 * np.sin(np.arange(12.0))
     native = play(made, lambda built: NativeEngine(built, 1), 20, action)

@@ -118,6 +118,7 @@ def test_its_state_is_that_of_the_seed_alone(
     assert_states(a, b, lambda x, y: np.testing.assert_allclose(x, y, rtol=1e-4, atol=1e-4))
 
 
+@pytest.mark.slow
 def test_a_batch_resumes_bit_for_bit(
     stand_config: TrainConfig,
     short_stand_config: TrainConfig,
@@ -133,6 +134,7 @@ def test_a_batch_resumes_bit_for_bit(
         assert_states(a, b, np.testing.assert_array_equal)
 
 
+@pytest.mark.slow
 def test_a_batch_killed_while_it_saved_goes_back_to_the_common_checkpoint(
     stand_config: TrainConfig, template: TrainState, whole: Path, tmp_path: Path
 ) -> None:
@@ -184,6 +186,7 @@ def test_a_seed_goes_on_alone(stand_config: TrainConfig, whole: Path, tmp_path: 
     assert done.env_steps == 128
 
 
+@pytest.mark.slow
 def test_a_seed_that_diverges_stops_alone(
     stand_config: TrainConfig,
     template: TrainState,
@@ -243,6 +246,7 @@ def test_time_that_is_over_stops_and_saves(
     assert_states(stored(template, tmp_path / "b-s5"), start, np.testing.assert_array_equal)
 
 
+@pytest.mark.slow
 def test_the_command_line_names_and_sources_every_seed(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

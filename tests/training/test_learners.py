@@ -110,6 +110,7 @@ def constant_source(size: int, action: float) -> ring.RingBuffer:
     return ring.from_transitions(rows)
 
 
+@pytest.mark.slow
 def test_a_learner_of_its_own_trains_a_run_to_its_end(
     clone: Learner, clone_config: TrainConfig, tmp_path: Path
 ) -> None:

@@ -143,7 +143,7 @@ def test_stored_experience_and_networks_can_be_read_alone(
     jax.tree.map(np.testing.assert_array_equal, stored["critic"], final.learner.critic)
 
 
-@pytest.mark.parametrize("capacity", [40, 20])
+@pytest.mark.parametrize("capacity", [pytest.param(40, marks=pytest.mark.slow), 20])
 def test_stored_experience_is_what_the_ring_still_holds(
     capacity: int, stand_config: TrainConfig, tmp_path: Path
 ) -> None:

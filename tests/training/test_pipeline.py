@@ -70,7 +70,10 @@ def test_collected_data_are_used_again_until_settings_change(
     assert digest != pipeline.collection_digest(config, source)
 
 
-@pytest.mark.parametrize("variant", ["weights", "twirl+weights", "twirl", "zero-shot"])
+@pytest.mark.parametrize(
+    "variant",
+    [pytest.param("weights", marks=pytest.mark.slow), "twirl+weights", "twirl", "zero-shot"],
+)
 def test_adaptation_starts_from_the_nominal_run(
     biped: TrainConfig, runs: Path, variant: str
 ) -> None:
