@@ -263,6 +263,10 @@ APPENDS = {
 OWN_WAYS = {"write_text", "write_bytes", "read_text", "read_bytes", "savefig", "rename", "savez"}
 
 
+THINGS = ("os", "Image", "run_dir", "sink", "_terminal", "webbrowser")
+"""Whose ``open`` opens no file of ours by name, or is looked at elsewhere."""
+
+
 def own_ways(source: str) -> tuple[int, list[str]]:
     """Return how often a source opens a file itself, and what it reads or writes itself."""
     opened, others = 0, []
@@ -271,7 +275,7 @@ def own_ways(source: str) -> tuple[int, list[str]]:
             continue
         called = ast.unparse(node.func)
         owner, _, name = called.rpartition(".")
-        of_a_thing = owner.rpartition(".")[2] in ("os", "Image", "run_dir", "sink", "_terminal")
+        of_a_thing = owner.rpartition(".")[2] in THINGS
         opened += name == "open" and not of_a_thing
         if owner in ("files", "array_files"):
             continue

@@ -20,7 +20,7 @@ from twirl_mjx.training.source import collect
 from twirl_mjx.worlds.make import make_env
 
 KEY = jax.random.key(0)
-CALM = dataclasses.replace(IDEAL, episode_s=4.0, sim_dt=0.005, hurdle_gap=50.0)
+CALM = dataclasses.replace(IDEAL, episode_s=4.0, sim_dt=0.005, hurdle_gap=10.0)
 QUICK = RehearsalConfig(episode_s=0.4, sim_dt=0.005)
 
 

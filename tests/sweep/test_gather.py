@@ -195,7 +195,7 @@ def test_the_documented_grid_of_your_own(tmp_path: Path, finish_run: Finish) -> 
     page = write_report(results, tmp_path / "report.html", say=said.append).read_text()
     assert all(f"tau = {t}, critics = {n}" in page for t in ("0.005", "0.01") for n in (2, 4))
     assert "What you vary" in page
-    assert said == []
+    assert [line for line in said if not line.startswith("drawing grid")] == []
 
 
 @pytest.mark.slow
