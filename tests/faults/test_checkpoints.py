@@ -290,3 +290,23 @@ def test_the_simulated_disk_drops_what_was_not_forced(disk: Disk, tmp_path: Path
     assert {p.name: p.read_text() for p in (tmp_path / "cut").iterdir()} == {
         "kept": "x", "empty": "",
     }  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        (lambda metrics: metrics | {"new": metrics["cosine"]}, "new is not in the checkpoint"),
+        (lambda metrics: {"cosine": metrics["cosine"]}, "is only in the checkpoint"),
+    ],
+    ids=["more", "less"],
+)
+def test_a_state_of_another_version_is_named(
+    change: Callable[..., Any], told: str, saved: Path, fresh: TrainState
+) -> None:
+    other = fresh.replace(env=fresh.env.replace(metrics=change(dict(fresh.env.metrics))))
+    checkpoints = Checkpoints(saved)
+    try:
+        with pytest.raises(ValueError, match=f"another version .*{told}"):
+            checkpoints.restore(jax.eval_shape(lambda: other))
+    finally:
+        checkpoints.close()

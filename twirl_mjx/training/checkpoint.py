@@ -14,7 +14,7 @@ order. A damaged checkpoint is stepped over.
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Set
 from pathlib import Path
 from typing import Any
 
@@ -197,16 +197,31 @@ class Checkpoints:
         """Return one checkpoint."""
         bare = template.replace(replay=template.replay.replace(source=None, online=_bare(template)))
         flat = _abstract(bare)
-        found = self._manager.restore(
-            step,
-            args=ocp.args.Composite(
-                train_state=ocp.args.StandardRestore(flat), progress=ocp.args.JsonRestore()
-            ),
-        )
+        try:
+            found = self._manager.restore(
+                step,
+                args=ocp.args.Composite(
+                    train_state=ocp.args.StandardRestore(flat), progress=ocp.args.JsonRestore()
+                ),
+            )
+        except ValueError:
+            self._check_parts(step, flat.keys())
+            raise
         state = _unflatten(bare, {k: np.asarray(v) for k, v in found["train_state"].items()})
         online = self._read_rows(state, template)
         replay = template.replay.replace(online=online)
         return state.replace(replay=replay), dict(found["progress"])
+
+    def _check_parts(self, step: int, names: Set[str]) -> None:
+        """Raise ValueError where a stored state has other parts than ``names``."""
+        stored = _train_state(self._manager, step).keys()
+        if other := sorted(stored ^ names):
+            where = "only in the checkpoint" if other[0] in stored else "not in the checkpoint"
+            raise ValueError(
+                f"{self._run_dir} was written by another version of this program (versions.json):"
+                f" {len(other)} parts of the state differ ({other[0]} is {where}). Go on with that"
+                " version, or give another --name"
+            )
 
     def close(self) -> None:
         """Release the manager."""
@@ -332,6 +347,12 @@ def _open(run_dir: Path) -> tuple[ocp.CheckpointManager, int]:
     return ocp.CheckpointManager(root / "orbax", item_names=items), steps[-1]
 
 
+def _train_state(manager: ocp.CheckpointManager, step: int) -> dict[str, Any]:
+    """Return the stored arrays by their names, whatever they are."""
+    args = ocp.args.Composite(train_state=ocp.args.StandardRestore())
+    return manager.restore(step, args=args)["train_state"]
+
+
 def load_learner(run_dir: Path) -> dict[str, Any]:
     """Return actor, critic, target_critic and log_temperature of a run's newest checkpoint.
 
@@ -340,9 +361,7 @@ def load_learner(run_dir: Path) -> dict[str, Any]:
         DamagedError: The newest is damaged.
     """
     manager, step = _open(run_dir)
-    flat = manager.restore(step, args=ocp.args.Composite(train_state=ocp.args.StandardRestore()))[
-        "train_state"
-    ]
+    flat = _train_state(manager, step)
     manager.close()
     nested: dict[str, Any] = {}
     for name, value in flat.items():
