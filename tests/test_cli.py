@@ -180,6 +180,7 @@ def test_collect_says_what_happened(
     assert ("done" in said) == collects == (path.exists() and "nothing" not in said)
 
 
+@pytest.mark.slow
 def test_whole_method_on_the_debug_preset(tmp_path: Path) -> None:
     command = [
         sys.executable, "-m", "twirl_mjx", "train", "--task", "biped", "--preset", "debug",

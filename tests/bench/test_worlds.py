@@ -36,6 +36,7 @@ def check_bare_physics(engine: str, error: float) -> None:
     )
 
 
+@pytest.mark.slow
 def test_bare_native_physics_is_that_of_the_environment() -> None:
     """The environment rounds states to float32 after every control step."""
     check_bare_physics("native", 1e-4)

@@ -56,6 +56,7 @@ def reading_of(qpos: np.ndarray, qvel: np.ndarray) -> Reading:
     return Reading(quaternion_matrix(qpos[3:7]), qvel[3:6], qpos[7:], qpos[:3])
 
 
+@pytest.mark.slow
 def test_the_observation_is_the_simulation_s_and_the_contract_s(
     task: Imitate, states: list[tuple[np.ndarray, ...]]
 ) -> None:

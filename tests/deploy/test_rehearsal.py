@@ -14,7 +14,6 @@ from twirl_mjx.deploy.ground import build_model
 from twirl_mjx.deploy.rehearsal import IDEAL, RehearsalConfig, rehearse
 from twirl_mjx.deploy.robot import CommandFilter, Contacts, Sensors, motor_torque
 from twirl_mjx.policies.learned import PolicyHeader, save_policy
-from twirl_mjx.policies.scripted import BOUND, TROT, ClockedGait
 
 SHORT = dataclasses.replace(RehearsalConfig(), episode_s=0.5)
 HOME = np.tile([0.0, 0.9, -1.8], 4)
@@ -136,7 +135,7 @@ def test_position_drifts_as_a_random_walk(model: mujoco.MjModel) -> None:
 
 
 def test_episode_depends_on_its_seed_only() -> None:
-    results = [rehearse(ClockedGait(TROT), task="biped", episodes=2, seed=s, config=SHORT)
+    results = [rehearse("trot", task="biped", episodes=2, seed=s, config=SHORT)
                for s in (3, 3, 4)]  # fmt: skip
     first, same, other = (r.episodes for r in results)
     np.testing.assert_array_equal(first[1].qpos, same[1].qpos)
@@ -166,7 +165,7 @@ def test_falling_ends_a_stand_episode() -> None:
 
 def test_touching_a_hurdle_ends_the_episode() -> None:
     config = dataclasses.replace(IDEAL, hurdle_gap=0.6)
-    episode = rehearse(ClockedGait(BOUND), task="hurdles", episodes=1, config=config).episodes[0]
+    episode = rehearse("bound", task="hurdles", episodes=1, config=config).episodes[0]
     assert episode.cause == "hurdle"
     assert 0.1 < episode.qpos[-1, 0] < 0.6
     np.testing.assert_allclose(episode.goals, np.tile([0.6, 0.0], (len(episode.goals), 1)))

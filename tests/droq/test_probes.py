@@ -88,7 +88,10 @@ def solve(probe: Probe, *, is_fast: bool = True):
     return np.asarray(action[:, 0]), np.asarray(q)
 
 
-@pytest.mark.parametrize("is_fast", [True, False])
+BOTH = pytest.mark.parametrize("is_fast", [True, pytest.param(False, marks=pytest.mark.slow)])
+
+
+@BOTH
 def test_probe_1_value_of_a_constant_reward(is_fast):
     _, q = solve(constant_reward, is_fast=is_fast)
     np.testing.assert_allclose(q, 1.0, atol=0.1)
@@ -110,7 +113,7 @@ def test_probe_4_actor_finds_the_best_action():
     np.testing.assert_allclose(q, 0.0, atol=0.15)
 
 
-@pytest.mark.parametrize("is_fast", [True, False])
+@BOTH
 def test_probe_5_actor_follows_the_observation(is_fast):
     action, _ = solve(action_should_follow_observation, is_fast=is_fast)
     np.testing.assert_allclose(action, [-0.6, 0.6], atol=0.15)

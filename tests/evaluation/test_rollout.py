@@ -74,6 +74,7 @@ def test_only_the_first_episode_counts() -> None:
     np.testing.assert_array_equal(values["episode_length"], length)
 
 
+@pytest.mark.slow
 def test_conditions_together_equal_conditions_alone(config) -> None:
     policy = get_scripted("trot")
     together = evaluate_shifts(
@@ -85,6 +86,7 @@ def test_conditions_together_equal_conditions_alone(config) -> None:
     assert not np.allclose(together["none"]["return"], together["gravity"]["return"])
 
 
+@pytest.mark.slow
 def test_recording_has_one_row_per_step(config) -> None:
     recording = record_episode(config, get_scripted("zero"), seed=0, steps=5)
     assert recording.qpos.shape == (5, 19)
@@ -94,6 +96,7 @@ def test_recording_has_one_row_per_step(config) -> None:
     assert np.isfinite(recording.qpos).all()
 
 
+@pytest.mark.slow
 def test_goals_of_a_recording_lie_on_the_hill(config) -> None:
     sloped = dataclasses.replace(config, shift="sloped")
     goals = record_episode(sloped, get_scripted("zero"), seed=0, steps=2).goals

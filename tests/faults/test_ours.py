@@ -92,6 +92,7 @@ def test_commands_refuse_before_they_begin(
     assert sorted(p.name for p in tmp_path.iterdir()) == [name]
 
 
+@pytest.mark.slow
 def test_figures_check_all_before_they_draw_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -115,6 +115,7 @@ def test_the_action_reaches_the_same_joint_targets() -> None:
     assert np.abs(memory.previous).max() == 1.0
 
 
+@pytest.mark.slow
 def test_own_tasks_as_contracts_show_what_their_observers_show(env: VectorEnv) -> None:
     """Two control steps of a real episode, histories included."""
     policy = meet(ready.find_contract("biped", A1))

@@ -17,7 +17,7 @@ import pytest
 from rich.console import Console
 
 from twirl_mjx.commands import sweep
-from twirl_mjx.figures.tables import read_curves
+from twirl_mjx.figures.tables import read_table
 from twirl_mjx.sweep import estimate, scheduler
 from twirl_mjx.sweep.grid import load
 from twirl_mjx.sweep.plan import make_plan
@@ -82,7 +82,7 @@ def test_tables_hold_more_than_what_was_asked_for(
         argv = [str(grid_file), "--gather-only", "--runs", str(runs), "--results", str(results)]
         assert sweep.main([*argv, *more]) == 0
         paths = [p for p in (results / "phi").glob("*.csv") if "episodes" not in p.name]
-        tables = {p.stem: read_curves(p) for p in paths}
+        tables = {p.stem: read_table(p) for p in paths}
         return {arm: len(set(table["seed"])) for arm, table in tables.items()}
 
     all_arms = {"biped-phi0.25": 2, "biped-phi0.5": 2, "biped-zs": 1}

@@ -16,7 +16,7 @@ from twirl_mjx.figures.cells import lead_metrics
 from twirl_mjx.figures.plots import make_figures, read_grids
 from twirl_mjx.figures.report import write_report
 from twirl_mjx.figures.summary import summarise
-from twirl_mjx.figures.tables import read_curves, read_directory, read_episodes
+from twirl_mjx.figures.tables import read_directory, read_episodes, read_table
 from twirl_mjx.sweep.describe import describe
 from twirl_mjx.sweep.gather import gather, nominal_notes, settings_of, thin
 from twirl_mjx.sweep.grid import Grid, grids_folder, load
@@ -49,7 +49,7 @@ def test_tables_of_a_finished_grid(
     ]
     assert text[3] == "run,task,shift,variant,seed,metric,env_steps,grad_steps,wall_s,value,phi"
 
-    curves = read_curves(folder / "biped-phi0.5.csv")
+    curves = read_table(folder / "biped-phi0.5.csv")
     assert set(curves["metric"]) == {"eval/return"}
     assert set(curves["phi"]) == {"0.5"}
     for seed in (0, 1):
@@ -175,6 +175,7 @@ def documented_grid() -> str:
     return code
 
 
+@pytest.mark.slow
 def test_the_documented_grid_of_your_own(tmp_path: Path, finish_run: Finish) -> None:
     """From the file to tables, figures and the report; its runs are made up."""
     path, runs, results = tmp_path / "mine.py", tmp_path / "runs", tmp_path / "results"

@@ -123,6 +123,7 @@ def batch() -> GymnasiumVectorEnv:
     return to_gymnasium_vector("stand", num_envs=3, engine="native", config=CONFIG)
 
 
+@pytest.mark.slow
 def test_vector_env_resets_in_the_same_step(batch: GymnasiumVectorEnv) -> None:
     """Two worlds fall into their time limit together; a third one a step later."""
     obs, info = batch.reset(seed=3)
@@ -148,6 +149,7 @@ def test_vector_env_resets_in_the_same_step(batch: GymnasiumVectorEnv) -> None:
             np.testing.assert_array_equal(info["final_info"]["upright"], info["upright"])
 
 
+@pytest.mark.slow
 def test_vector_env_agrees_with_the_single_one(
     batch: GymnasiumVectorEnv, gym: GymnasiumEnv
 ) -> None:
@@ -245,6 +247,7 @@ def test_brax_view_takes_both_kinds_of_keys(brax_view: Any) -> None:
     assert (brax_view.action_size, brax_view.backend) == (12, "native")
 
 
+@pytest.mark.slow
 def test_brax_wrappers() -> None:
     """brax's own batching, episode and auto-reset wrappers around a single world, jitted."""
     from brax.envs.base import Env

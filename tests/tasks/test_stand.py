@@ -44,7 +44,11 @@ def numpy_terms(model: mujoco.MjModel, qpos: np.ndarray, height_of: str) -> tupl
 
 
 @pytest.mark.parametrize(
-    ("options", "height_of"), [({}, "root"), ({"options": FEET}, "front_feet")]
+    ("options", "height_of"),
+    [
+        ({}, "root"),
+        pytest.param({"options": FEET}, "front_feet", marks=pytest.mark.slow),
+    ],
 )
 def test_reward_recomputed_from_the_state(
     options: dict[str, Any],

@@ -94,6 +94,7 @@ def alone(stand_config: TrainConfig, tmp_path_factory: pytest.TempPathFactory) -
     return pipeline.run(config, "debug", folder, "b-s5", lambda _: None).path
 
 
+@pytest.mark.slow
 def test_a_run_of_a_batch_looks_like_one_trained_alone(whole: Path, alone: Path) -> None:
     ours = whole / "b-s5"
     assert files_of(ours) == files_of(alone)
@@ -110,6 +111,7 @@ def test_a_run_of_a_batch_looks_like_one_trained_alone(whole: Path, alone: Path)
     assert {row["seed"] for row in rows_of(whole / "b-s3" / "metrics.csv")} == {"3"}
 
 
+@pytest.mark.slow
 def test_its_state_is_that_of_the_seed_alone(
     template: TrainState, whole: Path, alone: Path
 ) -> None:
@@ -154,6 +156,7 @@ def test_a_batch_killed_while_it_saved_goes_back_to_the_common_checkpoint(
         assert len({(r["metric"], r["env_steps"]) for r in now}) == len(now)
 
 
+@pytest.mark.slow
 def test_seeds_without_a_common_checkpoint_are_named(
     stand_config: TrainConfig, whole: Path, tmp_path: Path
 ) -> None:
@@ -170,6 +173,7 @@ def test_seeds_without_a_common_checkpoint_are_named(
     assert stored_steps(folder / "b-s5") == [64, 96]
 
 
+@pytest.mark.slow
 def test_finished_seeds_are_left_alone(stand_config: TrainConfig, whole: Path) -> None:
     before = (whole / "b-s3" / "metrics.csv").read_bytes()
     said = train(stand_config, whole)
@@ -177,6 +181,7 @@ def test_finished_seeds_are_left_alone(stand_config: TrainConfig, whole: Path) -
     assert (whole / "b-s3" / "metrics.csv").read_bytes() == before
 
 
+@pytest.mark.slow
 def test_a_seed_goes_on_alone(stand_config: TrainConfig, whole: Path, tmp_path: Path) -> None:
     shutil.copytree(whole / "b-s5", tmp_path / "b-s5")
     longer = dataclasses.replace(stand_config, seed=5, total_env_steps=128)
@@ -295,6 +300,7 @@ def test_unusable_seeds_and_times_are_refused(
     assert not (tmp_path / "runs").exists()
 
 
+@pytest.mark.slow
 def test_python_gets_one_result_for_each_seed(whole: Path) -> None:
     results = twirl_mjx.train("stand", preset="debug", name="b", runs=whole, seeds=iter(SEEDS))
     assert [result.config.seed for result in results] == list(SEEDS)

@@ -129,6 +129,7 @@ def test_a_learner_of_its_own_trains_a_run_to_its_end(
     np.testing.assert_allclose(policy.act(obs).mean(0), 0.5, atol=0.1)
 
 
+@pytest.mark.slow
 def test_the_compiled_epoch_uses_the_learner_of_the_settings(
     clone: Learner, clone_config: TrainConfig
 ) -> None:

@@ -82,6 +82,7 @@ def test_resumed_run_equals_whole_run_bit_for_bit(
     assert_identical(a, b)
 
 
+@pytest.mark.slow
 def test_a_run_goes_on_from_the_checkpoint_before_a_damaged_one(
     stand_config: TrainConfig,
     whole_run: Path,
@@ -143,7 +144,8 @@ def test_stored_experience_and_networks_can_be_read_alone(
     jax.tree.map(np.testing.assert_array_equal, stored["critic"], final.learner.critic)
 
 
-@pytest.mark.parametrize("capacity", [pytest.param(40, marks=pytest.mark.slow), 20])
+@pytest.mark.slow
+@pytest.mark.parametrize("capacity", [40, 20])
 def test_stored_experience_is_what_the_ring_still_holds(
     capacity: int, stand_config: TrainConfig, tmp_path: Path
 ) -> None:
@@ -319,11 +321,13 @@ def test_non_finite_world_never_reaches_the_ring(
     stand_config: TrainConfig, capfd: pytest.CaptureFixture[str]
 ) -> None:
     env = make_env(stand_config)
-    train_state = state.init(stand_config, env, jax.random.key(0), None)
+    init = jax.jit(lambda key: state.init(stand_config, env, key, None))
+    train_state = init(jax.random.key(0))
     data = train_state.env.data
     poisoned = data.replace(qvel=data.qvel.at[1, 0].set(jnp.nan))
     train_state = train_state.replace(env=train_state.env.replace(data=poisoned))
-    after, result, fault = state.collect_step(stand_config, env, train_state, jax.random.key(1))
+    collect = jax.jit(lambda *args: state.collect_step(stand_config, env, *args))
+    after, result, fault = collect(train_state, jax.random.key(1))
     assert np.asarray(result.invalid).tolist() == [False, True, False, False]
     assert np.asarray(fault).tolist() == [0, 1, 0, 0]
     assert FAULTS[1] == "the physical state was not finite"

@@ -72,7 +72,12 @@ def test_collected_data_are_used_again_until_settings_change(
 
 @pytest.mark.parametrize(
     "variant",
-    [pytest.param("weights", marks=pytest.mark.slow), "twirl+weights", "twirl", "zero-shot"],
+    [
+        pytest.param("weights", marks=pytest.mark.slow),
+        pytest.param("twirl+weights", marks=pytest.mark.slow),
+        "twirl",
+        "zero-shot",
+    ],
 )
 def test_adaptation_starts_from_the_nominal_run(
     biped: TrainConfig, runs: Path, variant: str
@@ -134,6 +139,7 @@ def test_replay_of_the_nominal_run_is_the_source(runs: Path) -> None:
     assert np.isfinite(rows).all()
 
 
+@pytest.mark.slow
 def test_onnx_source_acts_like_the_policy_it_came_from(
     biped: TrainConfig, runs: Path, tmp_path: Path
 ) -> None:
@@ -174,6 +180,7 @@ def test_a_finished_run_is_left_as_it_is(biped: TrainConfig, runs: Path) -> None
     assert before == after
 
 
+@pytest.mark.slow
 def test_weights_act_and_are_measured_from_the_first_step(biped: TrainConfig, runs: Path) -> None:
     path = runs / NOMINAL
     config = dataclasses.replace(

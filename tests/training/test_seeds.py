@@ -70,6 +70,7 @@ def single_stages(stand_config: TrainConfig, env: VectorEnv) -> Stages:
     return stages
 
 
+@pytest.mark.slow
 def test_seeds_start_as_they_start_alone(batch_stages: Stages, single_stages: Stages) -> None:
     jax.tree.map(
         np.testing.assert_array_equal, seeds.seed_state(batch_stages[0][0], 1), single_stages[0][0]

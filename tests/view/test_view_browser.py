@@ -53,6 +53,7 @@ def test_a_replay_shows_the_robot_and_scrubs(browser: Any, tmp_path: Any) -> Non
     assert urls <= {"file", "data"}
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(180)
 def test_the_live_page_shows_the_robot_and_its_controls_act(browser: Any, still: Stage) -> None:
     with serving(still, "live", port=0) as address:

@@ -9,6 +9,8 @@ All functions are pure and may be vmapped over a leading seed axis of state, min
 
 from __future__ import annotations
 
+import functools
+
 import jax
 import jax.numpy as jnp
 
@@ -21,6 +23,7 @@ from twirl_mjx.types import Learner, MetricInfo, Metrics, Transition
 __all__ = ["LEARNER", "DroqState", "init", "mean_action", "sample_action", "update"]
 
 
+@functools.partial(jax.jit, static_argnums=(1, 2, 3))
 def init(key: jax.Array, config: DroqConfig, obs_size: int, action_size: int) -> DroqState:
     """Draw fresh networks for observations of length O and actions of length A."""
     actor_key, critic_key = jax.random.split(key)

@@ -132,7 +132,7 @@ def steps_axis(axes: Axes, *, ticks: int = 5, label: bool = True) -> None:
 
 def png_bytes(figure: Figure) -> bytes:
     """Return a figure as PNG of 256 colours (a third of the size); the same each time."""
-    with Image.open(io.BytesIO(_encode(figure, "png", {"Software": None}))) as picture:
+    with Image.open(io.BytesIO(_encode(figure))) as picture:
         small = picture.convert("RGB").quantize(256, Quantize.MEDIANCUT, dither=Dither.NONE)
     buffer = io.BytesIO()
     about = PngInfo()
@@ -141,22 +141,19 @@ def png_bytes(figure: Figure) -> bytes:
     return buffer.getvalue()
 
 
-def svg_bytes(figure: Figure) -> bytes:
-    """Return a figure as SVG with outlined text; the same figure gives the same bytes."""
-    return _encode(figure, "svg", {"Date": None, "Creator": None})
-
-
 def write_png(figure: Figure, path: Path) -> Path:
     """Write a figure as PNG, making the directory, and return the path."""
     files.write_bytes(path, png_bytes(figure))
     return path
 
 
-def _encode(figure: Figure, kind: str, metadata: dict) -> bytes:
+def _encode(figure: Figure) -> bytes:
     colours = theme_of("light")  # the artists carry their colours; this fixes dpi, hash and hatch
     with matplotlib.style.context(["default", rc_params(colours)]):
         buffer = io.BytesIO()
-        figure.savefig(buffer, format=kind, metadata=metadata, facecolor=figure.get_facecolor())
+        figure.savefig(
+            buffer, format="png", metadata={"Software": None}, facecolor=figure.get_facecolor()
+        )
     return buffer.getvalue()
 
 

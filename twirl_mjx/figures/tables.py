@@ -156,18 +156,6 @@ def read_table(path: str | Path) -> Table:
     return Table(columns, tuple(notes), str(path))
 
 
-def read_curves(path: str | Path) -> Table:
-    """Read a curve table (``metrics.csv``); see ``read_table``.
-
-    Raises:
-        TableError: If the file is not a valid curve table.
-    """
-    table = read_table(path)
-    if table.is_episodes:
-        raise TableError(f"{path}: an episode table, expected {','.join(CURVE_COLUMNS)}")
-    return table
-
-
 def read_episodes(path: str | Path) -> Table:
     """Read an episode table (``eval.csv``); see ``read_table``.
 

@@ -192,27 +192,6 @@ class RandomPolicy:
         return jax.random.uniform(key, state.world.action.shape, jnp.float32, -1.0, 1.0), memory
 
 
-class ClockedGait:
-    """A gait as a deployable policy: numpy only, and one clock that ``reset`` stops."""
-
-    def __init__(self, gait: Gait, robot: Robot = A1) -> None:
-        self.gait = gait
-        self.robot = robot
-        self.clock = 0
-
-    def reset(self) -> None:
-        """Start the gait anew."""
-        self.clock = 0
-
-    def act(self, obs: np.ndarray) -> np.ndarray:
-        """Return the next action [..., A]; of ``obs`` [..., O] only the shape is used."""
-        fade = min(self.clock / max(self.gait.ramp_steps, 1), 1.0)
-        table = action_table(self.gait, self.robot)
-        action = table[self.clock % self.gait.period_steps] * np.float32(fade)
-        self.clock += 1
-        return np.broadcast_to(action, (*np.shape(obs)[:-1], len(action))).copy()
-
-
 SCRIPTED: dict[str, Callable[[Robot], SourcePolicy]] = {
     "trot": functools.partial(GaitPolicy, TROT),
     "bound": functools.partial(GaitPolicy, BOUND),
