@@ -4,16 +4,28 @@
 .DEFAULT_GOAL := help
 TWIRL := .venv/bin/twirl
 PYTEST := .venv/bin/pytest
-CASE = $(if $(TASK),--task $(TASK)) $(if $(SHIFT),--shift $(SHIFT)) $(if $(SEED),--seed $(SEED))
+
+# What these are given is data, of which neither make nor the shell runs a word. ARGS is shell.
+GIVEN := TASK SHIFT SEED RUN GRID MINUTES EXAMPLES WHEELS PYTHON ACCEL
+$(foreach name,$(GIVEN),$(if $(value $(name)),$(eval override $(name) := $$(value $(name)))))
+define NEWLINE
+
+
+endef
+quoted = '$(subst $(NEWLINE), ,$(subst ','\'',$(1)))'
+option = $(if $($(2)),--$(1) $(call quoted,$($(2))))
+RUNS = $(foreach run,$(RUN),$(call quoted,$(run)))
+CASE = $(call option,task,TASK) $(call option,shift,SHIFT) $(call option,seed,SEED)
 
 .PHONY: help setup bench-setup gpu-setup lint format test test-slow test-gpu test-jax-oldest \
+	test-faults fuzz audit \
 	gpu-counts gpu-proof train evaluate collect sweep figures report render view demo bench \
 	curriculum docs dist clean
 
 help: ## show this table
 	@echo 'usage: make TARGET [TASK=..] [SHIFT=..] [SEED=..] [RUN=..] [GRID=..] [ARGS=".."]'
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  %-16s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
-	@echo 'ARGS is handed on as it is: make train TASK=biped ARGS="--preset debug"'
+	@echo 'ARGS is a piece of a shell command: make train TASK=biped ARGS="--preset debug"'
 	@echo 'All options of a command: .venv/bin/twirl COMMAND --help'
 
 setup: ## make or refresh .venv (PYTHON=/path/to/python3.12, ACCEL=cpu|cuda12|cuda13|tpu)
@@ -51,19 +63,29 @@ gpu-counts: gpu-setup ## count GPU operations per update, without a GPU
 	JAX_PLATFORMS=cpu .venv-gpu/bin/twirl bench gpu-compile $(ARGS)
 
 gpu-proof: ## parity, timings and a real training on a GPU (MINUTES=9 WHEELS=folder: no network)
-	@MINUTES=$(or $(MINUTES),9) WHEELS=$(WHEELS) .ci/gpu-proof $(ARGS)
+	@MINUTES=$(call quoted,$(or $(MINUTES),9)) WHEELS=$(call quoted,$(WHEELS)) .ci/gpu-proof $(ARGS)
+
+test-faults: setup ## the break campaign: kills, full disks, damage, power cuts (under 30 minutes)
+	$(PYTEST) -m "not gpu" tests/faults $(ARGS)
+
+fuzz: setup ## the readers of files, fed by hypothesis for some ten minutes (EXAMPLES=4000)
+	TWIRL_FUZZ=$(call quoted,$(or $(EXAMPLES),4000)) $(PYTEST) -m slow tests/faults/campaign/test_fuzz.py $(ARGS)
+
+audit: ## look for known weaknesses of the locked packages (does nothing without a network)
+	@.ci/setup audit
+	@.ci/audit
 
 train: setup ## train TASK= under SHIFT= with SEED= (ARGS="--preset debug --variant scratch")
 	$(TWIRL) train $(CASE) $(ARGS)
 
 evaluate: setup ## evaluate RUN=runs/NAME (several may be given; ARGS="--shifts icy")
-	$(TWIRL) evaluate $(RUN) $(ARGS)
+	$(TWIRL) evaluate $(RUNS) $(ARGS)
 
 collect: setup ## record a source policy in TASK= as a dataset
 	$(TWIRL) collect $(CASE) $(ARGS)
 
 sweep: setup ## run what is missing of GRID= (a module of experiments/)
-	$(TWIRL) sweep $(GRID) $(ARGS)
+	$(TWIRL) sweep $(if $(GRID),$(call quoted,$(GRID))) $(ARGS)
 
 figures: setup ## rebuild all figures from the committed tables
 	$(TWIRL) figures $(ARGS)
@@ -72,10 +94,10 @@ report: setup ## write the results as one HTML page
 	$(TWIRL) report $(ARGS)
 
 render: setup ## film RUN=runs/NAME as mp4 and a strip of frames
-	$(TWIRL) render $(RUN) $(ARGS)
+	$(TWIRL) render $(RUNS) $(ARGS)
 
 view: setup ## watch RUN= (or the shipped biped) in a browser (ARGS="--html replay.html")
-	$(TWIRL) view $(RUN) $(ARGS)
+	$(TWIRL) view $(RUNS) $(ARGS)
 
 demo: setup ## render and evaluate the shipped policies; trains nothing
 	$(TWIRL) demo $(ARGS)
@@ -84,7 +106,7 @@ bench: bench-setup ## measure this machine, beside SBX
 	$(TWIRL) bench $(ARGS)
 
 curriculum: setup ## train the chain of TASK= with SEED= (ARGS="--shifts": without the shifts)
-	$(TWIRL) curriculum $(if $(TASK),--task $(TASK)) $(if $(SEED),--seed $(SEED)) $(ARGS)
+	$(TWIRL) curriculum $(call option,task,TASK) $(call option,seed,SEED) $(ARGS)
 
 docs: ## build the pages and the API reference into build/site
 	@.ci/setup docs
@@ -99,5 +121,6 @@ dist: setup ## build wheel and sdist into dist/, and try the wheel in an environ
 
 clean: ## remove caches and build products (keeps .venv and runs/)
 	rm -rf build dist .pytest_cache .ruff_cache
-	find . -path ./.venv -prune -o -path ./.venv-bench -prune -o -path ./.venv-docs -prune -o -path ./runs -prune -o \
+	find . -path ./.venv -prune -o -path ./.venv-bench -prune -o -path ./.venv-docs -prune \
+		-o -path ./.venv-audit -prune -o -path ./runs -prune -o \
 		-name __pycache__ -type d -prune -exec rm -rf {} +

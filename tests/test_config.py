@@ -59,6 +59,15 @@ def test_paper_preset_has_the_numbers_of_table_4() -> None:
         (lambda: DroqConfig(hidden_sizes=()), "hidden_sizes"),
         (lambda: TrainConfig(num_envs=0), r"nearest: 1\)"),
         (lambda: TrainConfig(replay=ReplayConfig(capacity=8)), "capacity 8 is below"),
+        (
+            lambda: TrainConfig(replay=ReplayConfig(phi=0.001)),
+            r"phi 0\.001 of droq\.batch_size 256 rounds to no source row \(nearest: 0\.00390625\)",
+        ),
+        (
+            lambda: TrainConfig(replay=ReplayConfig(phi=0.999)),
+            r"phi 0\.999 .* rounds to no online row \(nearest: 0\.996094\)",
+        ),
+        (lambda: TrainConfig(droq=DroqConfig(batch_size=1)), r"no source row \(nearest: 0\)"),
         (lambda: TrainConfig(seed=-1), r"seed = -1 is outside \[0, 4294967295\] \(nearest: 0\)"),
         (lambda: TrainConfig(seed=2**32), r"seed = 4294967296 .*nearest: 4294967295"),
     ],
@@ -66,6 +75,12 @@ def test_paper_preset_has_the_numbers_of_table_4() -> None:
 def test_bad_values_are_refused_with_the_nearest_valid(build, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         build()
+
+
+def test_a_share_that_is_not_used_is_not_judged() -> None:
+    assert TrainConfig(variant="scratch", replay=ReplayConfig(phi=0.001)).effective_phi == 0.0
+    for phi in (0.0, 1 / 256, 0.99609375, 1.0):
+        TrainConfig(replay=ReplayConfig(phi=phi))
 
 
 def test_updates_that_do_not_divide_are_refused_with_the_numbers() -> None:

@@ -57,6 +57,11 @@ def test_unknown_shift_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
     assert "nearest: 'icy'" in capsys.readouterr().err
 
 
+def test_a_shift_given_twice_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["curriculum", "--preset", "debug", "--shifts", "icy", "none", "icy"]) == 2
+    assert "names one twice (nearest: --shifts icy none)" in capsys.readouterr().err
+
+
 @pytest.mark.slow
 def test_a_chain_runs_and_is_not_repeated(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]

@@ -62,7 +62,7 @@ def test_unknown_accelerator_is_refused(project: Path, accel: str) -> None:
 def test_unknown_environment_is_refused(project: Path) -> None:
     result = setup(project, "tests")
     assert result.returncode == 2
-    assert "valid: main bench gpu oldest docs" in result.stderr
+    assert "valid: main bench gpu oldest docs audit" in result.stderr
 
 
 def test_unfit_interpreter_is_named_with_the_range(project: Path) -> None:

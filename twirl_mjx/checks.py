@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 
 def nearest(value: object, choices: Iterable[object]) -> str:
@@ -37,6 +37,31 @@ def check_choice(what: str, value: str, choices: tuple[str, ...]) -> None:
     """
     if value not in choices:
         raise ValueError(f"unknown {what} {value!r}: {choose_one(value, choices)}")
+
+
+def check_once(what: str, values: Sequence[object]) -> None:
+    """Refuse values of which one is given twice.
+
+    Raises:
+        ValueError: The message has what was given, and each of it once.
+    """
+    if len(set(values)) != len(values):
+        once = " ".join(map(str, dict.fromkeys(values)))
+        given = " ".join(map(str, values))
+        raise ValueError(f"{what} {given} names one twice (nearest: {what} {once})")
+
+
+def check_printable(what: str, text: str) -> None:
+    """Refuse a name with line breaks or other characters that cannot be seen.
+
+    Tables and logs would be broken by them.
+
+    Raises:
+        ValueError: The message shows the name escaped, and the nearest that can be seen.
+    """
+    if not text.isprintable():
+        seen = "".join(char if char.isprintable() else "_" for char in text)
+        raise ValueError(f"{what} {text!a} has characters that cannot be seen (nearest: {seen!r})")
 
 
 def check_range(what: str, value: float, low: float, high: float) -> None:

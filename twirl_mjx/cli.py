@@ -49,10 +49,10 @@ def _usage() -> str:
     )
 
 
-def _set_environment() -> None:
-    """Choose the compilation cache before anything heavy is imported.
+def _set_environment(joins_cluster: bool = False) -> None:
+    """Choose the compilation cache, and who may reach Ray, before anything heavy is imported.
 
-    By an environment variable, which child processes inherit. Settings of jax itself win.
+    By environment variables, which child processes inherit. Settings of jax and Ray themselves win.
     """
     if (folder := cache_folder(os.environ)) is not None:
         os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(folder))
@@ -60,6 +60,8 @@ def _set_environment() -> None:
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
     logging.getLogger("matplotlib").setLevel(logging.ERROR)  # where HOME cannot be written
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # Ray would report to its makers
+    if not joins_cluster:  # Ray's processes then listen to this machine alone, on Linux too
+        os.environ.setdefault("RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER", "0")
 
 
 def set_up(draws: bool) -> None:
@@ -145,7 +147,7 @@ def main(argv: list[str] | None = None) -> int:
     debug = os.environ.get("TWIRL_DEBUG", "") not in ("", "0")
     undo = (lambda: None) if debug else _show_one_line_each(name)
     try:
-        _set_environment()
+        _set_environment(any(word.partition("=")[0] == "--address" for word in rest))
         if name in DRAWING:  # these parse their options before they import the simulation
             return _import_command(name).main(rest, set_up)
         os.environ.setdefault("MUJOCO_GL", "disable")

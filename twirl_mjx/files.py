@@ -132,17 +132,25 @@ def csv_text(rows: Iterable[Sequence[object]]) -> str:
 def check_target(path: str | Path) -> Path:
     """Return the file to replace, links followed, after checking that it can be replaced.
 
+    Nothing is written, so this is asked before any work is done, too.
+
     Raises:
         FileError: Something that is no regular file is there.
-        OSError: A loop of links, a name that is too long, a file where a folder is meant.
+        OSError: A loop of links, a name that is too long, a file where a folder is meant, or a
+            folder in which nothing can be written.
     """
     target = Path(os.path.realpath(path))
-    try:
+    with contextlib.suppress(FileNotFoundError):
         mode = target.stat().st_mode
-    except FileNotFoundError:
-        return target
-    if not stat.S_ISREG(mode):
-        raise FileError(f"{path} is {_kind(mode)} and would be replaced: name a file to write")
+        if not stat.S_ISREG(mode):
+            raise FileError(f"{path} is {_kind(mode)} and would be replaced: name a file to write")
+    folder = next(parent for parent in target.parents if parent.exists())
+    if not folder.is_dir():
+        raise NotADirectoryError(errno.ENOTDIR, os.strerror(errno.ENOTDIR), str(path))
+    if not os.access(folder, os.W_OK | os.X_OK):
+        frozen = os.name == "posix" and os.statvfs(folder).f_flag & os.ST_RDONLY
+        number = errno.EROFS if frozen else errno.EACCES
+        raise OSError(number, os.strerror(number), str(path))
     return target
 
 

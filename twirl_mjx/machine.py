@@ -1,9 +1,13 @@
-"""What differs between operating systems: cores and locks. Linux and macOS have both."""
+"""What differs between operating systems: cores, locks and a place for them."""
 
 from __future__ import annotations
 
+import errno
 import os
+import stat
 import sys
+import tempfile
+from pathlib import Path
 from typing import TextIO
 
 UNSUPPORTED = (
@@ -24,6 +28,40 @@ def usable_cores() -> list[int]:
     if hasattr(os, "sched_getaffinity"):
         return sorted(os.sched_getaffinity(0))
     return list(range(os.cpu_count() or 1))
+
+
+def runtime_folder() -> Path:
+    """Return this user's own folder for locks and the like on this machine, made if missing.
+
+    In ``/run/user/UID`` where there is one, else in the folder of temporary files, where anybody
+    may have made it: what is there is trusted only if nobody else can have written it.
+
+    Raises:
+        PermissionError: It belongs to somebody else, is a link, or others may write into it.
+    """
+    uid = os.getuid()
+    session = Path(f"/run/user/{uid}")
+    parent = session if _is_own(session) else Path(tempfile.gettempdir())
+    folder = parent / f"twirl_mjx-{uid}"
+    folder.mkdir(mode=0o700, exist_ok=True)
+    if not _is_own(folder):
+        why = "not a folder that only you can write into: remove it, or set TMPDIR to one of yours"
+        raise PermissionError(errno.EACCES, why, str(folder))
+    return folder
+
+
+def _is_own(folder: Path) -> bool:
+    try:
+        status = os.lstat(folder)
+    except OSError:
+        return False
+    others = stat.S_IWGRP | stat.S_IWOTH
+    return (
+        stat.S_ISDIR(status.st_mode)
+        and status.st_uid == os.getuid()
+        and not status.st_mode & others
+        and os.access(folder, os.W_OK | os.X_OK)
+    )
 
 
 def try_lock(file: TextIO, *, shared: bool = False) -> bool:

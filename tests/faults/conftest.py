@@ -79,3 +79,51 @@ def node(tmp_path: Path) -> Iterator[Callable[[str], Path]]:
     yield make
     for made in sockets:
         made.close()
+
+
+class Disk:
+    """Knows what of a folder would outlive a power cut: what was forced to disk, nothing else.
+
+    A file has the content of its last ``fsync``, and a name is there if its folder was forced to
+    disk since. Folders that were never forced are empty, and files without ``fsync`` too.
+    """
+
+    def __init__(self, root: Path) -> None:
+        self.root = root
+        self.contents: dict[int, bytes] = {}
+        self.entries: dict[int, dict[str, tuple[int, bool]]] = {}
+        self.at_sync: Callable[[], None] = lambda: None
+        self._force = os.fsync
+
+    def fsync(self, descriptor: int) -> None:
+        self._force(descriptor)
+        path = Path(os.readlink(f"/proc/self/fd/{descriptor}"))
+        inode = os.fstat(descriptor).st_ino
+        if path.is_dir():
+            self.entries[inode] = {
+                entry.name: (entry.inode(), entry.is_dir()) for entry in os.scandir(path)
+            }
+        elif path.exists():
+            self.contents[inode] = path.read_bytes()
+        self.at_sync()
+
+    def after_the_cut(self, target: Path) -> None:
+        """Write what is left to another folder."""
+        self._write(self.root.stat().st_ino, target)
+
+    def _write(self, folder: int, target: Path) -> None:
+        target.mkdir()
+        for name, (inode, is_folder) in self.entries.get(folder, {}).items():
+            if is_folder:
+                self._write(inode, target / name)
+            else:
+                (target / name).write_bytes(self.contents.get(inode, b""))
+
+
+@pytest.fixture
+def disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Disk]:
+    root = tmp_path / "run"
+    root.mkdir()
+    made = Disk(root)
+    monkeypatch.setattr(os, "fsync", made.fsync)
+    yield made

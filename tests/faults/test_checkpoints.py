@@ -6,7 +6,7 @@ import dataclasses
 import json
 import os
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -197,56 +197,8 @@ def test_checkpoints_of_older_versions_are_read_and_then_replaced(
     assert json.loads((run_dir / "checkpoints" / "unsealed.json").read_text()) == []
 
 
-class Disk:
-    """Knows what of a folder would outlive a power cut: what was forced to disk, nothing else.
-
-    A file has the content of its last ``fsync``, and a name is there if its folder was forced to
-    disk since. Folders that were never forced are empty, and files without ``fsync`` too.
-    """
-
-    def __init__(self, root: Path) -> None:
-        self.root = root
-        self.contents: dict[int, bytes] = {}
-        self.entries: dict[int, dict[str, tuple[int, bool]]] = {}
-        self.at_sync: Callable[[], None] = lambda: None
-        self._force = os.fsync
-
-    def fsync(self, descriptor: int) -> None:
-        self._force(descriptor)
-        path = Path(os.readlink(f"/proc/self/fd/{descriptor}"))
-        inode = os.fstat(descriptor).st_ino
-        if path.is_dir():
-            self.entries[inode] = {
-                entry.name: (entry.inode(), entry.is_dir()) for entry in os.scandir(path)
-            }
-        else:
-            self.contents[inode] = path.read_bytes()
-        self.at_sync()
-
-    def after_the_cut(self, target: Path) -> None:
-        """Write what is left to another folder."""
-        self._write(self.root.stat().st_ino, target)
-
-    def _write(self, folder: int, target: Path) -> None:
-        target.mkdir()
-        for name, (inode, is_folder) in self.entries.get(folder, {}).items():
-            if is_folder:
-                self._write(inode, target / name)
-            else:
-                (target / name).write_bytes(self.contents.get(inode, b""))
-
-
-@pytest.fixture
-def disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Disk]:
-    root = tmp_path / "run"
-    root.mkdir()
-    made = Disk(root)
-    monkeypatch.setattr(os, "fsync", made.fsync)
-    yield made
-
-
 def test_a_power_cut_at_any_moment_leaves_whole_checkpoints(
-    disk: Disk, fresh: TrainState, tmp_path: Path
+    disk: Any, fresh: TrainState, tmp_path: Path
 ) -> None:
     """Four saves, the power cut after each ``fsync`` of them and before the next."""
     cuts: list[Path] = []
@@ -277,7 +229,7 @@ def test_a_power_cut_at_any_moment_leaves_whole_checkpoints(
     assert len(cuts) > 4 * 10
 
 
-def test_the_simulated_disk_drops_what_was_not_forced(disk: Disk, tmp_path: Path) -> None:
+def test_the_simulated_disk_drops_what_was_not_forced(disk: Any, tmp_path: Path) -> None:
     """The test above would notice: a file without ``fsync`` is empty, a name may be missing."""
     for name in ("kept", "empty"):
         (disk.root / name).write_text("x")

@@ -133,6 +133,21 @@ def test_a_read_only_disk(frozen_disk: Path) -> None:
     assert [p.name for p in frozen_disk.iterdir()] == ["old.txt"]
 
 
+def test_where_nothing_can_be_written_is_said_before_any_work(
+    frozen_disk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Folders are made when the file is written, and judged by the nearest that is there."""
+    assert files.check_target(tmp_path / "no" / "such" / "a.json") == tmp_path / "no/such/a.json"
+    assert not (tmp_path / "no").exists()
+    for name in ("old.txt", "no/such/a.json"):
+        with pytest.raises(OSError, match=name) as error:
+            files.check_target(frozen_disk / name)
+        assert error.value.errno == errno.EROFS
+    monkeypatch.setattr(os, "access", lambda path, mode: False)  # root may write anywhere
+    with pytest.raises(PermissionError, match=r"no/such/a\.json"):
+        files.check_target(tmp_path / "no" / "such" / "a.json")
+
+
 def test_what_a_killed_process_left_is_swept_by_the_next_write(tmp_path: Path) -> None:
     """Of the same target only, and not what a living process is writing."""
     code = """

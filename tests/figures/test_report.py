@@ -171,6 +171,15 @@ def test_unusable_clips_are_refused(tmp_path):
         page.clip(Media(tmp_path / "a.mp4"))
 
 
+def test_a_missing_clip_is_said_before_anything_is_drawn(tmp_path, write, rows_of):
+    rows = rows_of("biped", "none", "twirl", 0, points=2)
+    write(tmp_path / "mine" / "a.csv", tables.CURVE_COLUMNS, rows)
+    said = []
+    with pytest.raises(MediaError, match=r"nope\.mp4: no such file"):
+        report.write_report(tmp_path, tmp_path / "r.html", [tmp_path / "nope.mp4"], say=said.append)
+    assert said == []
+
+
 def test_numbers_are_written_alike():
     assert wording.interval_text(Interval(1446.4, 1317.6, 1594.0)) == "1,446 [1,318, 1,594]"
     assert wording.interval_text(Interval(0.5, 0.25, 0.75)) == "0.50 [0.25, 0.75]"

@@ -298,6 +298,27 @@ def _float(data: dict, frames: np.ndarray) -> None:
     frames[:, 2] += 0.5
 
 
+def _instant(data: dict, frames: np.ndarray) -> None:
+    data["FrameDuration"] = 1e-30
+
+
+def _for_ever(data: dict, frames: np.ndarray) -> None:
+    data["FrameDuration"] = 1e30
+
+
+def _still_and_instant(data: dict, frames: np.ndarray) -> None:
+    data["FrameDuration"] = 1e-30
+    frames[:] = frames[0]  # at no speed, whatever the time between them
+
+
+def _out_of_this_world(data: dict, frames: np.ndarray) -> None:
+    frames[:, 0] += 1e30
+
+
+def _joints(data: dict, frames: np.ndarray) -> None:
+    frames[3, 7] = 1e6
+
+
 RATE = 1.0 / read_clip(asset_path("a1", "leap.json")).frame_duration
 
 
@@ -312,7 +333,13 @@ RATE = 1.0 / read_clip(asset_path("a1", "leap.json")).frame_duration
          Conversion(quaternion="wxyz")),
         (_laikago, r"frame \d+: the left flank points up by .*--imitate\.clip-root laikago",
          Conversion(root="laikago")),
-        (_rate, r"FrameDuration is \d+ s, limit 0\.25 \(frames per second\?", Conversion(fps=RATE)),
+        (_rate, r"FrameDuration is \d+ s, limits 0\.0005 to 0\.25 \(frames per second\?",
+         Conversion(fps=RATE)),
+        (_instant, r"FrameDuration is 1e-30 s, limits .*\(frames per second\? .*-fps 2000\)", None),
+        (_for_ever, r"FrameDuration is 1e\+30 s, limits .* --imitate\.clip-fps 4\)", None),
+        (_still_and_instant, r"FrameDuration is 1e-30 s, limits 0\.0005 to 0\.25", None),
+        (_out_of_this_world, r"frame \d+: the root is at x = 1e\+30 m, limit 1000", None),
+        (_joints, r"frame 3: joint FR_hip_joint is 1e\+06 rad, limit 6\.28", None),
         (_jump, r"frame 5: joint \w+ jumps at .* rad/s, limit 60", None),
         (_spin, r"frame \d+: joint FR_calf_joint is .* rad, limits -2\.7 to -0\.9", None),
         (_float, r"frame \d+: the lowest foot of the clip is 0\.\d+ m high, limits", None),

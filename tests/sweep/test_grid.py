@@ -58,10 +58,19 @@ def test_settings_are_applied_at_once() -> None:
         ),
         (block(base={"droq.hidden_sizes": 256}), r"droq.hidden_sizes = 256 is int.*\(256,\)"),
         (block(axes={"t": {"x": {"task": 5}}}), "arm x: task = 5 is int, expected str"),
+        (5, "here = 5 is int, expected dict"),
+        (block(seeds=3), "here: seeds = 3 is int, expected tuple"),
+        (block(base=[1]), r"here: base = \[1\] is list, expected dict"),
+        (block(axes={"t": {}}), "axis 't' has no label"),
+        (block(axes={"t": ["biped"]}), "axis 't' = .* is list, expected dict"),
+        (block(axes={"t": {1: {}}}), "label of axis 't' = 1 is int, expected str"),
+        (block(axes={"t": {"a": 1}}), "label 'a' = 1 is int, expected dict"),
+        (block(axes={"t": {"a/b": {}}}), r"label 'a/b' .* name \(nearest: 'a_b'\)"),
+        (block(axes={"t": {"a\n": {}}}), r"label of axis 't' 'a\\n' .*nearest: 'a_'"),
         (block(seeds=(2**32,)), r"seed = 4294967296 is outside \[0, 4294967295\]"),
     ],
 )
-def test_bad_blocks_are_refused(bad: dict[str, Any], message: str) -> None:
+def test_bad_blocks_are_refused(bad: Any, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         expand(bad, "here", None)
 
@@ -78,6 +87,22 @@ def test_an_unknown_grid_names_the_nearest() -> None:
         load("fi")
     with pytest.raises(ValueError, match="no grid file"):
         load("nowhere/phi.py")
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("raise SystemExit(0)", "no grid: SystemExit"),
+        ("GRID = 1 / 0", "no grid: ZeroDivisionError"),
+        (f"GRID = ({block()!r},)\nRESULTS = 3", "RESULTS = 3 is int, expected dict"),
+        (f"REDUCED = ({block()!r},)\nREDUCED_NOTE = 'a\\nb'", "REDUCED_NOTE .*nearest: 'a_b'"),
+    ],
+)
+def test_modules_that_are_no_grid_are_refused(text: str, message: str, tmp_path: Path) -> None:
+    path = tmp_path / "odd.py"
+    path.write_text(text)
+    with pytest.raises(ValueError, match=rf"odd\.py.*{message}"):
+        load(str(path), reduced="REDUCED" in text)
 
 
 def test_a_module_without_the_form_is_refused(tmp_path: Path) -> None:

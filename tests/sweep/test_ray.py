@@ -90,6 +90,17 @@ def sweep(folder: Path, *, background: bool = False) -> subprocess.Popen[str]:
     )
 
 
+def listening(pid: int) -> set[str]:
+    """Return the addresses at which a process and all it has started listen."""
+    first = psutil.Process(pid)
+    return {
+        connection.laddr.ip
+        for process in (first, *first.children(recursive=True))
+        for connection in process.net_connections("inet")
+        if connection.status == psutil.CONN_LISTEN
+    }
+
+
 def runs_below(folder: Path) -> list[psutil.Process]:
     """Return the living training processes of a folder."""
     found = []
@@ -114,6 +125,7 @@ def test_a_sweep_killed_half_way_goes_on(tmp_path: Path) -> None:
     # killed when a cell is finished and another one is at work
     wait_for(lambda: list(tmp_path.glob("runs/*/eval.csv")), "no cell finished")
     wait_for(lambda: runs_below(tmp_path), "no cell is running")
+    assert listening(first.pid) <= {"127.0.0.1", "::1", "::ffff:127.0.0.1"}
     first.send_signal(signal.SIGKILL)
     first.communicate()
     wait_for(lambda: not runs_below(tmp_path), "runs outlived the sweep", 30)

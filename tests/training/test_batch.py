@@ -285,7 +285,7 @@ def test_the_command_line_names_and_sources_every_seed(
 @pytest.mark.parametrize(
     ("words", "told"),
     [
-        (["--seeds", "1", "2", "1"], "names a seed twice (nearest: --seeds 1 2)"),
+        (["--seeds", "1", "2", "1"], "--seeds 1 2 1 names one twice (nearest: --seeds 1 2)"),
         (["--seeds", "1", "2", "--seed", "3"], "give one of them (nearest: --seeds 1 2)"),
         (["--seeds", "1", "-2"], "seed"),
         (["--minutes", "0"], "minutes"),

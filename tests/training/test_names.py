@@ -55,3 +55,16 @@ def test_the_nominal_run_of_an_adaptation_is_the_plain_one(tmp_path: Path) -> No
     )
     found = pipeline._nominal_dir(config, "debug", tmp_path)
     assert found.path == tmp_path / "biped-twirl-debug-s4"
+
+
+@pytest.mark.parametrize(
+    ("name", "nearest"),
+    [("a\nb", "a_b"), ("a\rb", "a_b"), ("a\u2028b", "a_b"), ("a\0", "a_"), ("\u200b", "_"),
+     ("a\udcff", "a_")],
+)  # fmt: skip
+def test_names_that_would_break_tables_are_refused(name: str, nearest: str) -> None:
+    with pytest.raises(ValueError, match=rf"\(nearest: '{nearest}'\)$") as error:
+        rundir.check_name(name)
+    assert str(error.value).isprintable()
+    assert rundir.check_name(nearest) == nearest
+    assert rundir.check_name("läuft 3 ok") == "läuft 3 ok"

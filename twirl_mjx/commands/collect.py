@@ -16,10 +16,11 @@ def main(argv: list[str]) -> int:
     """Record a source policy in a target task as ``runs/<name>/source.npz``."""
     options = parse_collect(argv)
     with waiting("loading the trainer"):  # orbax and more, which options do not need
-        from twirl_mjx.training import pipeline, rundir
+        from twirl_mjx.training import memory, pipeline, rundir
         from twirl_mjx.training.sinks.registry import resolve
     config = options.config
     check_source(config, options.preset)
+    memory.check([memory.collecting(config)])
     sinks = resolve(options.log)
     name = options.name or rundir.default_name(config, options.preset)
     run_dir = rundir.RunDir(options.runs / rundir.check_name(name))

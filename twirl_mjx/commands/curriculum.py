@@ -8,7 +8,7 @@ from typing import Annotated
 
 import tyro
 
-from twirl_mjx.checks import check_choice
+from twirl_mjx.checks import check_choice, check_once
 from twirl_mjx.commands.console import parse, say
 from twirl_mjx.commands.options import default_preset
 from twirl_mjx.sim.dynamics import PAPER_SHIFTS, SHIFTS
@@ -114,6 +114,7 @@ def main(argv: list[str]) -> int:
     preset = options.preset or default_preset()
     check_choice("preset", preset, PRESETS)
     options = dataclasses.replace(options, shifts=tuple(map(SHIFTS.admit, options.shifts)))
+    check_once("--shifts", options.shifts)
     links = plan(options, preset)
     for number, (name, config) in enumerate(links, 1):
         say(f"link {number} of {len(links)}: {name}")

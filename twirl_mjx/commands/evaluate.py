@@ -16,12 +16,12 @@ from rich.console import Console
 from rich.table import Table
 
 from twirl_mjx import files
-from twirl_mjx.checks import check_range
+from twirl_mjx.checks import check_once, check_range
 from twirl_mjx.commands.console import say
 from twirl_mjx.commands.options import Overrides, parse_in_tasks, with_overrides
 from twirl_mjx.commands.render import config_of
 from twirl_mjx.commands.tables import check_settings, named, write_rows
-from twirl_mjx.evaluation.shifts import evaluate_shifts
+from twirl_mjx.evaluation.shifts import evaluate_shifts, scenes_of
 from twirl_mjx.figures.statistics import bootstrap, mean
 from twirl_mjx.sim.dynamics import PAPER_SHIFTS, SHIFTS
 from twirl_mjx.tasks.task import Task
@@ -100,11 +100,11 @@ def main(argv: list[str]) -> int:
     if not options.shifts:
         raise ValueError(f"--shifts needs a condition: any of {', '.join(SHIFTS.names())}")
     options = dataclasses.replace(options, shifts=tuple(map(SHIFTS.admit, options.shifts)))
-    if twice := [name for name in options.shifts if options.shifts.count(name) > 1]:
-        raise ValueError(f"--shifts names {twice[0]} twice: once is enough")
+    check_once("--shifts", options.shifts)
     out = options.out or Path("runs", f"evaluation-{time.strftime('%Y%m%d-%H%M%S')}.csv")
     check_outputs(out, options.figure, options.overwrite)
     settings = check_settings(options.setting)
+    check_memory(options)
     candidates = resolve_all(options, overrides)
     notes = f"# command: {shlex.join(['.venv/bin/twirl', 'evaluate', *argv])}\n"
     rows: list[list[object]] = []
@@ -136,6 +136,14 @@ def check_outputs(out: Path, figure: Path | None, overwrite: bool = False) -> No
             f"--figure {figure} is no PNG file (nearest: {figure.with_suffix('.png')})"
         )
     files.check_ours(figure, overwrite=overwrite)
+
+
+def check_memory(options: EvaluateOptions) -> None:
+    """Refuse more episodes than fit into memory: conditions on one ground run at once."""
+    from twirl_mjx.training import memory
+
+    at_once = options.episodes * max(map(len, scenes_of(options.shifts).values()))
+    memory.check([memory.acting("--episodes", options.episodes, at_once, options.engine)])
 
 
 def resolve_all(options: EvaluateOptions, overrides: Overrides) -> list[Candidate]:

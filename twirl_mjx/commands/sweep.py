@@ -11,8 +11,10 @@ from typing import Annotated
 import tyro
 from rich.console import Console
 
+from twirl_mjx import files
 from twirl_mjx.checks import check_range
 from twirl_mjx.commands.console import parse, say
+from twirl_mjx.machine import runtime_folder
 from twirl_mjx.sweep import estimate, gather, plan
 from twirl_mjx.sweep.grid import Grid, grids_folder, load
 from twirl_mjx.sweep.scheduler import Progress, RayExecutor, run_all
@@ -65,6 +67,10 @@ def main(argv: list[str]) -> int:
         load(options.grid, reduced=options.reduced, seeds=options.seeds or None), options.arms
     )
     runs = options.runs.resolve()
+    if not options.dry_run:
+        runtime_folder()  # refused here rather than by every worker
+        for folder in (runs, gather.tables_folder(grid, runs, _results(options))):
+            files.check_target(folder / "any")
     plan.make_plan(joined(whole, grid), runs, options.nominal)  # refused now, not when gathered
     cells = plan.make_plan(grid, runs, options.nominal)
     status: dict[str, plan.Status] = {cell.name: plan.status_of(cell, runs) for cell in cells}
@@ -89,10 +95,14 @@ def main(argv: list[str]) -> int:
     return code
 
 
+def _results(options: SweepOptions) -> Path:
+    return options.results or grids_folder() / "results"
+
+
 def _gather(grid: Grid, runs: Path, options: SweepOptions) -> None:
     """Write the tables of all arms, not only of those that were asked for, and say so."""
     cells = plan.make_plan(grid, runs, options.nominal)
-    results = options.results or grids_folder() / "results"
+    results = _results(options)
     written = gather.gather(grid, cells, runs, results)
     arms = [cell for cell in cells if cell.arm]
     finished = sum(plan.is_finished(cell, runs) for cell in arms)

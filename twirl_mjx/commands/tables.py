@@ -7,16 +7,22 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from twirl_mjx import files
+from twirl_mjx.checks import check_printable
 
 
 def named(word: str) -> tuple[str, str]:
-    """Return what the table calls a policy and what loads it, of NAME=POLICY or POLICY."""
+    """Return what the table calls a policy and what loads it, of NAME=POLICY or POLICY.
+
+    Raises:
+        ValueError: A name with line breaks or the like.
+    """
     from twirl_mjx.commands.render import name_of
 
     name, equals, given = word.partition("=")
     if equals and re.fullmatch(r"[\w+-]+", name) and not Path(word).exists():
         return name, given
-    return name_of(word), word
+    check_printable("the name of policy", found := name_of(word))
+    return found, word
 
 
 def check_settings(words: tuple[str, ...]) -> dict[str, str]:
@@ -30,6 +36,7 @@ def check_settings(words: tuple[str, ...]) -> dict[str, str]:
     settings: dict[str, str] = {}
     for word in words:
         name, _, value = (part.strip() for part in word.partition("="))
+        check_printable("--setting", word)
         if not name.isidentifier() or not value:
             raise ValueError(f"--setting {word!r} is not name=value (nearest: gap=2.4)")
         if name in RESERVED or name in settings:

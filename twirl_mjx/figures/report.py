@@ -83,12 +83,12 @@ def write_report(
     clips = [m if isinstance(m, Media) else Media(Path(m)) for m in media]
     if not grids and not clips:
         raise TableError(f"{results_dir}: no rows and no clips, nothing to report")
+    shown = "".join(page.clip(m) for m in clips)  # refused before minutes of drawing
     sections = []
     for i, (grid, tables) in enumerate(grids.items()):
         say(f"drawing grid '{grid}', {i + 1} of {len(grids)}")
         sections.append((grid, _facts(tables).title or f"Grid: {grid}", _grid_html(grid, *tables)))
     if clips:
-        shown = "".join(page.clip(m) for m in clips)
         sections.insert(1, ("clips", "Clips", f'<div class="clips">{shown}</div>'))
     sections.append(("terms", "How to read the numbers", TERMS))
     links = "".join(f'<li><a href="#{escape(k)}">{escape(t)}</a></li>' for k, t, _ in sections)

@@ -15,8 +15,10 @@ from twirl_mjx.sim import kinematics
 
 LIMIT_MARGIN = 0.3
 """rad, by which published motions, retargeted from animals, leave the joint limits."""
-MAX_FRAME_DURATION = 0.25
-"""s; slower clips are no motion of legs."""
+FRAME_DURATIONS = (0.0005, 0.25)
+"""s; faster clips are recorded by nothing, slower ones are no motion of legs."""
+MAX_DISTANCE = 1000.0
+"""m, of the root from the origin: beyond, float32 places a foot no better than to 0.1 mm."""
 MAX_HEIGHT = 3.0
 """m, of the root."""
 LOWEST_FOOT = (-0.15, 0.15)
@@ -31,10 +33,11 @@ def check_plausible(clip: Clip) -> None:
     Raises:
         ValueError: One line, see the module.
     """
-    for gate in (_check_angles, _check_duration, _check_height, _check_root, _check_jumps):
+    for gate in (
+        _check_duration, _check_angles, _check_height, _check_distance, _check_root, _check_jumps,
+        _check_limits, _check_ground,
+    ):  # fmt: skip
         gate(clip)
-    _check_limits(clip)
-    _check_ground(clip)
 
 
 def _refuse(clip: Clip, frame: int, what: str, limit: str, remedy: str) -> None:
@@ -50,10 +53,13 @@ def _check_angles(clip: Clip) -> None:
 
 
 def _check_duration(clip: Clip) -> None:
-    if clip.frame_duration > MAX_FRAME_DURATION:
+    low, high = FRAME_DURATIONS
+    if not low <= clip.frame_duration <= high:
+        usual = 1.0 <= clip.frame_duration <= 1000.0
+        fps = clip.frame_duration if usual else 1 / (low if clip.frame_duration < low else high)
         raise ValueError(
-            f"{clip.name}: FrameDuration is {clip.frame_duration:g} s, limit {MAX_FRAME_DURATION}"
-            f" (frames per second? --imitate.clip-fps {clip.frame_duration:g})"
+            f"{clip.name}: FrameDuration is {clip.frame_duration:g} s, limits {low} to {high}"
+            f" (frames per second? --imitate.clip-fps {fps:g})"
         )
 
 
@@ -65,6 +71,14 @@ def _check_height(clip: Clip) -> None:
         unit = "millimetres" if factor < 0.01 else "centimetres"
         _refuse(clip, frame, f"root height is {height:.4g} m", f"limit {MAX_HEIGHT:g}",
                 f"{unit}? --imitate.clip-metres {factor:g}")  # fmt: skip
+
+
+def _check_distance(clip: Clip) -> None:
+    frame, axis = np.unravel_index(int(np.abs(clip.root_pos).argmax()), clip.root_pos.shape)
+    value = clip.root_pos[frame, axis]
+    if abs(value) > MAX_DISTANCE:
+        _refuse(clip, int(frame), f"the root is at {'xyz'[axis]} = {value:.4g} m",
+                f"limit {MAX_DISTANCE:g}", "millimetres? --imitate.clip-metres 0.001")  # fmt: skip
 
 
 def _check_root(clip: Clip) -> None:

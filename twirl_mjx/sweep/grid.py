@@ -1,4 +1,6 @@
-"""Grids: plain data in ``experiments/*.py``, checked here and expanded into resolved configs.
+"""Grids: data in ``experiments/*.py``, checked here and expanded into resolved configs.
+
+A grid file is executed, like any Python program: load only files that you would run.
 
 A grid module holds ``GRID`` and ``REDUCED`` (a smaller form), each a tuple of *blocks*, and
 ``REDUCED_NOTE``. A block is a dict: ``preset``, ``seeds``, ``axes`` (axis -> label -> settings by
@@ -20,14 +22,18 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from twirl_mjx.checks import check_choice
+from twirl_mjx.checks import check_choice, check_printable
 from twirl_mjx.records import check_type
 from twirl_mjx.training.config import TrainConfig
 from twirl_mjx.training.config_json import settle
 from twirl_mjx.training.presets import PRESETS, make_config
 
-BLOCK_KEYS = ("preset", "seeds", "axes", "base", "nominal", "smoke")
-"""What a block may hold; the first three are needed."""
+BLOCK_TYPES = {
+    "preset": str, "seeds": tuple | list | range, "axes": dict, "base": dict, "nominal": dict,
+    "smoke": bool,
+}  # fmt: skip
+"""What a block may hold, and its type; the first three are needed."""
+BLOCK_KEYS = tuple(BLOCK_TYPES)
 RESULTS_KEYS = {"title": str, "about": str, "place": int, "titles": dict, "baseline": dict}
 """What ``RESULTS`` may hold, and its type."""
 
@@ -107,12 +113,13 @@ def load(name: str, *, reduced: bool = False, seeds: Sequence[int] | None = None
     form = "REDUCED" if reduced else "GRID"
     blocks = getattr(module, form, None)
     if not isinstance(blocks, tuple) or not blocks:
-        raise ValueError(f"{path}: {form} is {blocks!r}, expected a tuple of blocks")
+        raise ValueError(f"{path}: {form} is {blocks!r:.200}, expected a tuple of blocks")
     drafts: list[Draft] = []
     for number, block in enumerate(blocks):
         drafts += expand(block, f"{path.name}: {form}[{number}]", seeds)
     check_unique(drafts, f"{path.name}: {form}")
     note = str(getattr(module, "REDUCED_NOTE", "smaller budgets")) if reduced else ""
+    check_printable(f"{path}: REDUCED_NOTE", note)
     smoke = {bool(block.get("smoke", False)) for block in blocks}
     if len(smoke) > 1:
         raise ValueError(f"{path}: {form}: some blocks are smoke, some not (nearest: all or none)")
@@ -126,6 +133,7 @@ def check_results(shown: Mapping[str, Any], where: str) -> Mapping[str, Any]:
     Raises:
         ValueError: An unknown key (with the nearest), or a value of another type.
     """
+    check_type(f"{where}: RESULTS", shown, dict)
     for key, value in shown.items():
         check_choice(f"key in {where}: RESULTS", key, tuple(RESULTS_KEYS))
         check_type(f"{where}: RESULTS[{key!r}]", value, RESULTS_KEYS[key])
@@ -140,7 +148,7 @@ def _module(path: Path) -> ModuleType:
     module = importlib.util.module_from_spec(spec)
     try:
         spec.loader.exec_module(module)
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         raise ValueError(f"{path}: no grid: {type(error).__name__}: {error}") from error
     return module
 
@@ -153,13 +161,10 @@ def expand(block: Mapping[str, Any], where: str, seeds: Sequence[int] | None) ->
     """Return the cells of a block: the product of its axes, each with every seed.
 
     Raises:
-        ValueError: A missing or unknown key, no seeds, or a setting no config has.
+        ValueError: A missing or unknown key, a value of another type, a label that cannot be part
+            of a file's name, no seeds, or a setting no config has.
     """
-    for key in block:
-        check_choice(f"key in {where}", key, BLOCK_KEYS)
-    for key in BLOCK_KEYS[:3]:
-        if key not in block:
-            raise ValueError(f"{where} has no {key!r}, it needs {', '.join(BLOCK_KEYS[:3])}")
+    _check_block(block, where)
     check_choice(f"preset in {where}", block["preset"], PRESETS)
     own = tuple(block["seeds"])
     chosen = own if seeds is None or len(own) == 1 else tuple(seeds)
@@ -177,6 +182,31 @@ def expand(block: Mapping[str, Any], where: str, seeds: Sequence[int] | None) ->
             config = configure(block["preset"], settings | {"seed": seed}, f"{where}, arm {arm}")
             drafts.append(Draft(arm, block["preset"], config, nominal, labels))
     return drafts
+
+
+def _check_block(block: Any, where: str) -> None:
+    check_type(where, block, dict)
+    for key, value in block.items():
+        check_choice(f"key in {where}", key, BLOCK_KEYS)
+        check_type(f"{where}: {key}", value, BLOCK_TYPES[key])
+    for key in BLOCK_KEYS[:3]:
+        if key not in block:
+            raise ValueError(f"{where} has no {key!r}, it needs {', '.join(BLOCK_KEYS[:3])}")
+    for axis, choices in block["axes"].items():
+        check_type(f"{where}: axis {axis!r}", axis, str)
+        check_type(f"{where}: axis {axis!r}", choices, dict)
+        if not choices:
+            raise ValueError(f"{where}: axis {axis!r} has no label, so there are no cells")
+        for label, settings in choices.items():
+            check_type(f"{where}: a label of axis {axis!r}", label, str)
+            check_printable(f"{where}: label of axis {axis!r}", label)
+            if "/" in label or label.startswith("."):
+                nearest = label.replace("/", "_").lstrip(".") or "label"
+                raise ValueError(
+                    f"{where}: label {label!r} of axis {axis!r} cannot be part of a file's name"
+                    f" (nearest: {nearest!r})"
+                )
+            check_type(f"{where}: axis {axis!r}, label {label!r}", settings, dict)
 
 
 def configure(preset: str, settings: Settings, where: str) -> TrainConfig:

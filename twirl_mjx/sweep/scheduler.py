@@ -80,7 +80,8 @@ class RayExecutor:
         """Start Ray on this machine, or join a cluster.
 
         Args:
-            address: Address of a running Ray cluster; None starts Ray here, without server.
+            address: Address of a running Ray cluster; None starts Ray here, without server and
+                (by an environment variable that ``cli`` sets) for this machine alone.
             workers: Most jobs at once; None for one per core (or GPU fraction).
             gpus: GPUs per job, may be a fraction; None for one where there are any, else 0.
 

@@ -9,13 +9,12 @@ import platform
 import signal
 import subprocess
 import sys
-import tempfile
 import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
 
-from twirl_mjx.machine import CAN_PIN, try_lock, usable_cores
+from twirl_mjx.machine import CAN_PIN, runtime_folder, try_lock, usable_cores
 from twirl_mjx.sweep import launch
 
 POLL_S = 0.5
@@ -54,12 +53,14 @@ def claim_core() -> Iterator[int | None]:
 
     Yields:
         The core; None when the machine cannot pin or every core is held.
+
+    Raises:
+        PermissionError: See ``machine.runtime_folder``.
     """
     cores = usable_cores() if CAN_PIN else []
-    folder = Path(tempfile.gettempdir()) / f"twirl_mjx-cores-{os.getuid()}"
-    folder.mkdir(mode=0o700, exist_ok=True)
+    folder = runtime_folder()
     for core in cores:
-        with (folder / f"{core}.lock").open("a") as file:
+        with (folder / f"core-{core}.lock").open("a") as file:
             if not try_lock(file):
                 continue
             yield core

@@ -123,6 +123,7 @@ class TrainConfig(WorldConfig):
         check_updates(self.droq.utd, self.num_envs, self.droq.updates_per_block)
         per_epoch = self.steps_per_epoch * self.num_envs
         check_range("total_env_steps", self.total_env_steps, 1, countable - per_epoch)
+        check_source_rows(self.effective_phi, self.droq.batch_size)
         if self.replay.capacity < self.num_envs:
             raise ValueError(
                 f"replay.capacity {self.replay.capacity} is below num_envs {self.num_envs}"
@@ -169,6 +170,25 @@ class TrainConfig(WorldConfig):
                 "episode_length": self.eval.episode_length,
             }
         )
+
+
+def check_source_rows(phi: float, batch_size: int) -> None:
+    """Check that a minibatch holds a row of each side that ``phi`` asks for.
+
+    Raises:
+        ValueError: ``phi`` rounds to none, or to all; the message has the nearest that does not.
+    """
+    rows = round(phi * batch_size)
+    if phi in (0.0, 1.0) or 0 < rows < batch_size:
+        return
+    if batch_size == 1:
+        nearest, what = (0.0, "source") if not rows else (1.0, "online")
+    else:
+        nearest, what = (1 / batch_size, "source") if not rows else (1 - 1 / batch_size, "online")
+    raise ValueError(
+        f"replay.phi {phi:g} of droq.batch_size {batch_size} rounds to no {what} row (nearest:"
+        f" {nearest:g})"
+    )
 
 
 def check_updates(utd: float, num_envs: int, updates_per_block: int) -> None:

@@ -20,18 +20,18 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from twirl_mjx import exits, records
-from twirl_mjx.checks import choose_one
+from twirl_mjx import exits, files, records
+from twirl_mjx.checks import check_once, choose_one
 from twirl_mjx.policies import recorded
 from twirl_mjx.policies.foreign import MAX_CLIPPED
 from twirl_mjx.policies.resolve import SCRIPTED_SOURCES, Source, resolve_policy
 from twirl_mjx.replay import dataset, ring
-from twirl_mjx.training import loop, rundir, source_rules
+from twirl_mjx.training import loop, memory, rundir, source_rules
 from twirl_mjx.training.checkpoint import load_replay
 from twirl_mjx.training.config import TrainConfig
 from twirl_mjx.training.presets import make_config
 from twirl_mjx.training.run import Part
-from twirl_mjx.training.rundir import Busy, Finished, Foreign, RunDir
+from twirl_mjx.training.rundir import Busy, Finished, Foreign, RunDir, Status
 from twirl_mjx.training.sinks.base import Sink
 from twirl_mjx.training.sinks.registry import resolve_each
 from twirl_mjx.training.source import collect
@@ -144,10 +144,7 @@ def check_seeds(seeds: Sequence[int]) -> None:
     """
     if not seeds:
         raise ValueError("--seeds names no seed: give at least one, --seeds 0 1 2")
-    if len(set(seeds)) != len(seeds):
-        once = " ".join(str(seed) for seed in dict.fromkeys(seeds))
-        given = " ".join(map(str, seeds))
-        raise ValueError(f"--seeds {given} names a seed twice (nearest: --seeds {once})")
+    check_once("--seeds", seeds)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -173,8 +170,10 @@ def _run_all(
     deadline: float,
 ) -> None:
     """Train members whose configs differ in their seeds only."""
-    for member in members:
-        check_early(member.config, preset, member.run_dir, source)
+    found = [check_early(each.config, preset, each.run_dir, source) for each in members]
+    count = sum(not isinstance(status, Finished) for status in found)
+    if count and members[0].config.variant != "zero-shot":
+        memory.check_run(members[0].config, count)
     if members[0].config.variant != "scratch" and source is None:
         alone = [m for m in members if _outlived_its_source(m.config, preset, runs_dir, m.run_dir)]
         for member in alone:
@@ -205,17 +204,22 @@ def _run_all(
 
 def check_early(
     config: TrainConfig, preset: str, run_dir: RunDir, source: Source | None = None
-) -> None:
+) -> Status:
     """Refuse what can be refused before a source is found, which may mean to train it for an hour.
+
+    Returns:
+        The state of the directory.
 
     Raises:
         ValueError: Options that do not fit one another, the task or the variant.
+        OSError: Nothing can be written there.
         RunMismatchError: Another run lives there, or a finished one that cannot go on.
         RunBusyError: Another process works there.
     """
     if config.variant == "scratch" and source is not None:
         raise ValueError("variant scratch uses no source (nearest: variant 'twirl')")
     source_rules.check_source_is_used(config, preset)
+    files.check_target(run_dir.config)
     config.make_task()  # refuses options that only the task can judge
     config.evaluation.make_task()
     if config.variant != "scratch" and source is None:
@@ -223,6 +227,8 @@ def check_early(
     match run_dir.status(config):
         case Foreign(error) | Busy(error):
             raise error
+        case status:
+            return status
 
 
 def _outlived_its_source(config: TrainConfig, preset: str, runs_dir: Path, run_dir: RunDir) -> bool:

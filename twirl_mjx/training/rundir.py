@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 
 from twirl_mjx import exits, files
+from twirl_mjx.checks import check_printable
 from twirl_mjx.machine import try_lock
 from twirl_mjx.policies.learned import BEST_POLICY, LAST_POLICY
 from twirl_mjx.tasks.measures import episode_means
@@ -399,8 +400,9 @@ def check_name(name: str) -> str:
     """Return the name of a run, which is that of a folder in the folder of all runs.
 
     Raises:
-        ValueError: It leads elsewhere.
+        ValueError: It leads elsewhere, or has line breaks or the like.
     """
+    check_printable("name", name)
     if name == ".." or name != Path(name).name:
         nearest = Path(name).name.strip(".") or "run"
         raise ValueError(

@@ -30,25 +30,28 @@ if TYPE_CHECKING:
 
     from twirl_mjx.worlds.picture import Painter
 
-MAX_STATE = 1e4
-"""A world whose position or velocity exceeds this (SI units) counts as diverged."""
+MAX_DISTANCE = 1e4
+"""m, a robot farther from the origin counts as diverged."""
+
+OBSERVATION_LIMIT = 10 * MAX_DISTANCE
+"""Bound of the observation space, in the units of the layout: beyond it a world has diverged."""
 
 FAULTS = (
     "",
     "the physical state was not finite",
-    f"the physical state was beyond {MAX_STATE:g} (SI units)",
-    "the observation was not finite",
+    "the physical state was beyond what the robot reaches (worlds.vector.state_bounds)",
+    f"the observation was not finite or beyond {OBSERVATION_LIMIT:g}",
     "the reward was not finite",
     "the action was not finite",
+    f"the observation before the step was not finite or beyond {OBSERVATION_LIMIT:g}",
 )
 """Why a step was invalid; index 0: it was not."""
+BAD_ACTION, BAD_VIEW = 5, 6
+"""Faults of what was given to a step."""
 
 DRAW, NOISE, PUSH = 1001, 1002, 1003
 """What is folded into a world's key for draws that only some worlds make: the others' numbers do
 not depend on them. Beyond the numbers of the keys that a split gives."""
-
-OBSERVATION_LIMIT = 10 * MAX_STATE
-"""Bound of the observation space, in the units of the layout: no finite world ever reaches it."""
 
 PHYSICS_STATE = ("time", "qpos", "qvel", "ctrl", "qacc_warmstart")
 """Fields of ``mjx.Data`` that the next step depends on; it computes the others anew."""
@@ -87,6 +90,23 @@ class EnvState(flax.struct.PyTreeNode):
     def done(self) -> jax.Array:
         """[N] bool, the episode ended and the world was reset."""
         return self.terminated | self.truncated | self.invalid
+
+
+def state_bounds(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
+    """Return the lowest and highest [nq + nv] that a robot reaches unless its physics diverge.
+
+    Joints stay within half a turn of their limits. In one physics step nothing turns by more than
+    an eighth of a turn, and the trunk moves by no more than the length of a leg.
+    """
+    robot, dt = scene.robot, scene.options.sim_dt
+    turn = np.full(robot.num_joints + 3, np.pi / 4 / dt)  # rad/s
+    speed = np.full(3, (robot.thigh_length + robot.calf_length) / dt)  # m/s
+    far, unit = np.full(3, MAX_DISTANCE), np.full(4, 1.1)
+    low, high = robot.joint_limits.T
+    return (
+        np.concatenate([-far, -unit, low - np.pi, -speed, -turn]).astype(np.float32),
+        np.concatenate([far, unit, high + np.pi, speed, turn]).astype(np.float32),
+    )
 
 
 def _in_full_precision[**P, T](function: Callable[P, T]) -> Callable[P, T]:
@@ -147,6 +167,7 @@ class VectorEnv:
         self.episode_length = episode_length
         self.dynamics = broadcast(dynamics, num_envs)
         self.ranges = ranges
+        self._low, self._high = state_bounds(scene)
         self._recipe: Recipe | None = None
 
     def __repr__(self) -> str:
@@ -310,17 +331,19 @@ class VectorEnv:
     @_in_full_precision
     def _step(self, state: EnvState, action: jax.Array) -> tuple[EnvState, jax.Array]:
         finite_action = jnp.all(jnp.isfinite(action), axis=-1)
+        good_view = jnp.all(jnp.abs(state.obs) <= OBSERVATION_LIMIT, axis=-1)
         action = jnp.clip(jnp.nan_to_num(action.astype(jnp.float32)), -1.0, 1.0)
         world, command = jax.vmap(self._command)(state.world, state.data.ctrl, action)
         pushed = state.data.replace(qvel=jax.vmap(self._push)(world, state.data.qvel))
         data, trace = self.engine.step(pushed, command, world.dynamics)
         world, next_obs, outcome, fault = jax.vmap(self._judge_world)(world, command, trace)
-        fault = jnp.where(finite_action, fault, len(FAULTS) - 1)
+        fault = jnp.where(finite_action, fault, BAD_ACTION)
+        fault = jnp.where(good_view, fault, BAD_VIEW)
         invalid = fault > 0
         ended = EnvState(
             data=data,
             obs=next_obs,
-            next_obs=jnp.where(invalid[:, None], state.obs, next_obs),
+            next_obs=jnp.where(invalid[:, None], jnp.nan_to_num(state.obs), next_obs),
             reward=jnp.where(invalid, 0.0, outcome.reward),
             terminated=outcome.terminated & ~invalid,
             truncated=(world.episode_step >= self.episode_length) & ~invalid,
@@ -405,11 +428,11 @@ class VectorEnv:
         outcome = self.task.judge(world, view, self.scene)
         world = world.replace(goal=outcome.goal, task=outcome.task)
         obs = self.task.observer.observe(memory, world.goal, view.qpos, view.qvel)
-        state = jnp.concatenate([view.qpos, view.qvel])
+        state = jnp.concatenate([trace.qpos, trace.qvel], axis=-1)  # of every substep
         good = (  # in the order of FAULTS
             jnp.all(jnp.isfinite(state)),
-            jnp.all(jnp.abs(state) < MAX_STATE),
-            jnp.all(jnp.isfinite(obs)),
+            jnp.all((state >= self._low) & (state <= self._high)),
+            jnp.all(jnp.abs(obs) <= OBSERVATION_LIMIT),
             jnp.isfinite(outcome.reward),
         )
         first = jnp.argmin(jnp.stack(good)).astype(jnp.int32) + 1
