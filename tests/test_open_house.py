@@ -56,6 +56,7 @@ def test_examples_are_short(name: str) -> None:
     assert max(map(len, lines)) <= 100
 
 
+@pytest.mark.slow
 def test_a_task_of_ones_own_is_trained_evaluated_and_read_back(
     trot: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -24,7 +24,8 @@ CALM = dataclasses.replace(IDEAL, episode_s=4.0, sim_dt=0.005, hurdle_gap=10.0)
 QUICK = RehearsalConfig(episode_s=0.4, sim_dt=0.005)
 
 
-@pytest.mark.parametrize("task", ["biped", pytest.param("hurdles", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("task", ["biped", "hurdles"])
 def test_the_joystick_trot_becomes_source_data(
     task: str, graphs: SimpleNamespace, tmp_path: Path
 ) -> None:

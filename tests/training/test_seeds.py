@@ -77,6 +77,7 @@ def test_seeds_start_as_they_start_alone(batch_stages: Stages, single_stages: St
     )
 
 
+@pytest.mark.slow
 def test_experience_before_learning_agrees(batch_stages: Stages, single_stages: Stages) -> None:
     """The first epoch only warms up: physics, guards, resets and the ring, no network."""
     batch, single = batch_stages[1][0], single_stages[1][0]
