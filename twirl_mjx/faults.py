@@ -76,7 +76,9 @@ def explain(error: BaseException) -> Fault:
 def _without_space(error: BaseException) -> str | None:
     """Return what a full disk says, wherever in the chain of causes it stands."""
     link: BaseException | None = error
-    while link is not None:
+    seen: set[int] = set()  # an error may be its own cause: `raise error from error`
+    while link is not None and id(link) not in seen:
+        seen.add(id(link))
         if isinstance(link, OSError) and link.errno in NO_SPACE:
             return _system_text(link)
         if found := NO_SPACE_TEXT.search(str(link)):

@@ -85,6 +85,14 @@ def test_a_full_disk_is_found_behind_other_errors() -> None:
     assert fault.text.startswith("/some/file: No space left on device: free space")
 
 
+@pytest.mark.timeout(20)
+def test_errors_that_cause_one_another_are_explained() -> None:
+    """A clip's refusal was its own cause, and the command that read it never ended."""
+    first, second = ValueError("first"), ValueError("second")
+    first.__cause__, second.__cause__ = second, first
+    assert faults.explain(first) == ("first", exits.UNUSABLE)
+
+
 def test_a_full_disk_of_others_is_short_and_says_what_is_saved() -> None:
     error = ValueError(
         'RESOURCE_EXHAUSTED: Error writing "env.data/0.0" in database at "/runs/a/": Failed'

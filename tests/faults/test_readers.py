@@ -2,21 +2,25 @@
 
 from __future__ import annotations
 
+import dataclasses
+import json
 import random
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
-from twirl_mjx import cli, exits
+from twirl_mjx import array_files, cli, exits
 from twirl_mjx.assets import asset_path
 from twirl_mjx.deploy.export import export_onnx
 from twirl_mjx.figures.plots import make_figures
 from twirl_mjx.figures.tables import CURVE_COLUMNS, TableError, read_table
 from twirl_mjx.motion.formats import read_clip
 from twirl_mjx.policies.learned import load_policy
+from twirl_mjx.replay import dataset
 from twirl_mjx.sweep import gather, plan
 from twirl_mjx.sweep.plan import Cell
 from twirl_mjx.training import config_json
@@ -208,3 +212,26 @@ def test_bad_paths_and_numbers_are_one_line(
     assert err.count("\n") == 1
     assert sorted(tmp_path.iterdir()) == before
     assert np.lib  # numpy was imported before the working directory changed
+
+
+@pytest.mark.parametrize(
+    ("value", "message"),
+    [(np.float64(1e300), "not finite"), (np.complex64(1j), "need .*numbers")],
+)
+def test_numbers_that_float32_cannot_hold_are_refused(
+    value: Any, message: str, tmp_path: Path
+) -> None:
+    """1e300 became infinite on its way into the ring, after the check."""
+    path = tmp_path / "a.npz"
+    arrays = array_files.read_npz(asset_path("policies", "stand.npz"), "a policy")
+    bias = np.full(arrays["hidden_0/bias"].shape, value)
+    array_files.write_npz(path, arrays | {"hidden_0/bias": bias})
+    with pytest.raises(ValueError, match=rf"a\.npz.*hidden_0/bias .*{message}"):
+        load_policy(path)
+    header = dataset.DatasetHeader("stand", "none", "zero", 1, 2, 1, 0.0)
+    data = {"obs": np.full((1, 2), value), "action": np.zeros((1, 1)), "reward": np.zeros(1)}
+    data |= {"terminated": np.zeros(1, bool), "next_obs": np.zeros((1, 2))}
+    text = json.dumps(dataclasses.asdict(header))
+    array_files.write_npz(path, {"header": np.array(text)} | data)
+    with pytest.raises(ValueError, match=rf"a\.npz: obs .*{message}"):
+        dataset.read(path, task="stand", observation_size=2, action_size=1)

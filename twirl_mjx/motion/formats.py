@@ -143,7 +143,9 @@ def read_clip(
             robot=robot,
         )
     except ValueError as error:
-        raise error if str(path) in str(error) else ValueError(f"{path}: {error}") from error
+        if str(path) in str(error):
+            raise
+        raise ValueError(f"{path}: {error}") from error
 
 
 def _parse(path: Path) -> dict[str, Any]:

@@ -127,11 +127,20 @@ class PolicyHeader:
 
 
 def _as_params(actor_params: Mapping[str, Mapping[str, Any]]) -> Params:
-    """Copy a parameter tree to contiguous float32 numpy arrays."""
-    return {
-        layer: {name: np.ascontiguousarray(value, np.float32) for name, value in arrays.items()}
-        for layer, arrays in actor_params.items()
-    }
+    """Copy a parameter tree to contiguous float32 numpy arrays; what is too large becomes infinite.
+
+    Raises:
+        PolicyFileError: naming the first array that holds no real numbers.
+    """
+    for layer, arrays in actor_params.items():
+        for name, value in arrays.items():
+            if (kind := np.asarray(value).dtype).kind in "cUSOmM":
+                raise PolicyFileError(f"{layer}/{name} is of type {kind}, need real numbers")
+    with np.errstate(over="ignore"):
+        return {
+            layer: {name: np.ascontiguousarray(value, np.float32) for name, value in arrays.items()}
+            for layer, arrays in actor_params.items()
+        }
 
 
 def hidden_layers(params: Mapping[str, Any]) -> list[str]:

@@ -152,7 +152,8 @@ def _plain(path: Path, observation_size: int, action_size: int, task: str) -> Tr
             )
         if array.dtype.kind not in "fiub":
             raise DatasetError(f"{path}: {field} is of type {array.dtype}, need numbers")
-        bad = ~np.isfinite(array.astype(np.float64)).reshape(count, -1).all(axis=1)
+        with np.errstate(over="ignore"):  # what float32 cannot hold is infinite
+            bad = ~np.isfinite(array.astype(np.float32)).reshape(count, -1).all(axis=1)
         if bad.any():
             raise DatasetError(f"{path}: {field} is not finite in row {int(np.argmax(bad))}")
     if count < 2:

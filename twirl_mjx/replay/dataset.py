@@ -93,6 +93,9 @@ def read(
             raise DatasetError(f"{path}: {name} has shape {found}, the header says {shape}")
         if arrays[name].dtype.kind not in "fb":
             raise DatasetError(f"{path}: {name} is of type {arrays[name].dtype}, need numbers")
+        if arrays[name].dtype.kind == "f":
+            with np.errstate(over="ignore"):  # what float32 cannot hold is infinite
+                arrays[name] = arrays[name].astype(np.float32)
         bad = ~np.isfinite(arrays[name]).reshape(header.size, -1).all(axis=1)
         if bad.any():
             raise DatasetError(f"{path}: {name} is not finite in row {int(np.argmax(bad))}")

@@ -295,7 +295,7 @@ class RunDir:
 
     def open(self, config: TrainConfig, source: dict[str, str] | None = None) -> None:
         """Write down config, source and versions of the part of the run that follows."""
-        self.path.mkdir(parents=True, exist_ok=True)
+        files.make_folders(self.path)
         files.write_text(self.config, config_json.to_json(config))
         if source:
             files.write_json(self.source, source)
@@ -360,7 +360,8 @@ class RunDir:
         Raises:
             RunBusyError: Another process holds it; the message names that process.
         """
-        self.path.mkdir(parents=True, exist_ok=True)
+        files.make_folders(self.path)
+        files.sync(self.path.parent)  # a sweep may have made it
         with self.lock.open("a+") as file:
             deadline = time.monotonic() + wait_s
             while not try_lock(file):

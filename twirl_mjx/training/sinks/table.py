@@ -48,6 +48,7 @@ class Table:
         if not resumes:
             self._csv.writerow(COLUMNS)
             self._sync()
+            files.sync(run.directory)  # its name, too, outlives a power cut
 
     def log(
         self, env_steps: int, grad_steps: int, wall_s: float, values: Mapping[str, float]
