@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from twirl_mjx import files, plugins, records
 from twirl_mjx.checks import check_choice
 from twirl_mjx.droq.learner import LEARNER
-from twirl_mjx.policies import foreign, onnx_file, recorded, scripted
+from twirl_mjx.policies import foreign, onnx_file, recorded, rows, scripted
 from twirl_mjx.policies.clip import ClipPolicy
 from twirl_mjx.policies.contract import Contract
 from twirl_mjx.policies.function import BrainPolicy, brain_of_function, from_policy
@@ -106,10 +106,10 @@ def resolve_policy(
     if name in SCRIPTED_SOURCES:
         _refuse_terms(terms, f"{name} is scripted")
         return _scripted(name, config)
-    path = Path(name)
-    if recorded.is_recording(path):
+    if rows.is_recording(name):
         _refuse_terms(terms, f"{name} is recorded data")
-        return _recording(path, config)
+        return _recording(name, config)
+    path = Path(name)
     if resolve_policy_path(path).suffix == ".onnx":
         given = find_contract(terms.contract, ROBOTS.get(config.robot)) if terms.contract else None
         loaded = onnx_file.load_onnx(resolve_policy_path(path), given.memory if given else ())
@@ -200,14 +200,9 @@ def _function(reference: str, config: WorldConfig, terms: Terms) -> Source:
     return Source(policy, reference, digest, notes=foreign.describe(contract, robot))
 
 
-def _recording(path: Path, config: WorldConfig) -> Source:
-    layout, robot = config.make_task().observer.layout, ROBOTS.get(config.robot)
-    data, digest, shift = recorded.read(path, task=config.task, layout=layout, robot=robot)
-    notes = ("its rewards are taken as they were recorded",)
-    if shift and shift != config.shift:
-        notes += (f"it was recorded under shift {shift}, this is shift {config.shift}",)
-    policy = recorded.RecordedPolicy(str(path))
-    return Source(policy, str(path), digest, data=data, notes=notes)
+def _recording(name: str, config: WorldConfig) -> Source:
+    data, digest, notes = recorded.read(name, config)
+    return Source(recorded.RecordedPolicy(name), name, digest, data=data, notes=notes)
 
 
 def header_of(name: str) -> PolicyHeader | None:
@@ -218,7 +213,7 @@ def header_of(name: str) -> PolicyHeader | None:
         PolicyFileError: The file is no policy.
     """
     recorded.refuse_format(name)
-    if name in SCRIPTED_SOURCES or plugins.is_reference(name) or recorded.is_recording(Path(name)):
+    if name in SCRIPTED_SOURCES or plugins.is_reference(name) or rows.is_recording(name):
         return None
     path = resolve_policy_path(name)
     if path.suffix == ".onnx":
@@ -233,7 +228,7 @@ def takes_terms(name: str) -> bool:
         FileNotFoundError: Nothing to load there.
         PolicyFileError: The file is no policy.
     """
-    if name in SCRIPTED_SOURCES or recorded.is_recording(Path(name)):
+    if name in SCRIPTED_SOURCES or rows.is_recording(name):
         return False
     return header_of(name) is None
 

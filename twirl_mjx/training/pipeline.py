@@ -22,7 +22,7 @@ import jax.numpy as jnp
 
 from twirl_mjx import exits, records
 from twirl_mjx.checks import choose_one
-from twirl_mjx.policies import recorded
+from twirl_mjx.policies import recorded, rows
 from twirl_mjx.policies.foreign import MAX_CLIPPED
 from twirl_mjx.policies.resolve import SCRIPTED_SOURCES, Source, resolve_policy
 from twirl_mjx.replay import dataset, ring
@@ -233,7 +233,7 @@ def _outlived_its_source(config: TrainConfig, preset: str, runs_dir: Path, run_d
         case source_rules.Scripted():
             return False
         case source_rules.AtPath(path):
-            return not path.exists()
+            return not _is_there(path)
         case source_rules.InFile(reference):
             return not Path(reference.rpartition(":")[0]).expanduser().exists()
         case source_rules.RunOf(first):
@@ -321,7 +321,7 @@ def _find_sources(
                 shown = f"assets/policies/{path.name}"
                 say(f"source: the shipped policy {shown} (--source train trains your own)")
             recorded.refuse_format(str(path))
-            if not path.exists():
+            if not _is_there(path):
                 raise FileNotFoundError(no_such_source(path, runs_dir))
             return [at(path)] * len(members)
         case source_rules.RunOf():
@@ -338,6 +338,11 @@ def _find_sources(
                 say(f"stage 1 of 3: source policy, task {each.config.task}, in {each.run_dir}")
             _run_all(first, preset, runs_dir, say, None, deadline)
             return [at(each.run_dir.path) for each in first]
+
+
+def _is_there(path: Path) -> bool:
+    """Return whether a source may exist: what Minari keeps has a name and no path."""
+    return path.exists() or str(path).startswith(rows.MINARI)
 
 
 def no_such_source(path: Path, runs_dir: Path) -> str:
