@@ -121,6 +121,28 @@ def resolve_policy(
     return _learned(name, loaded, config, noise)
 
 
+def resolve_actor(name: str, config: WorldConfig, *, terms: Terms = PLAIN) -> Source:
+    """Return a source that acts; errors as :func:`resolve_policy`.
+
+    Raises:
+        ValueError: It is recorded data, which is not even read.
+    """
+    check_acts(name)
+    return resolve_policy(name, config, terms=terms)
+
+
+def check_acts(name: str) -> None:
+    """Refuse recorded data.
+
+    Raises:
+        ValueError: ``name`` is that of recorded data.
+    """
+    if rows.is_recording(name):
+        raise ValueError(
+            f"{name} is recorded data, which does not act (nearest: the policy behind it)"
+        )
+
+
 def _refuse_terms(terms: Terms, why: str) -> None:
     for option, value in (("contract", terms.contract), ("command", terms.command)):
         if value:

@@ -24,7 +24,7 @@ from twirl_mjx import exits, records
 from twirl_mjx.checks import choose_one
 from twirl_mjx.policies import recorded, rows
 from twirl_mjx.policies.foreign import MAX_CLIPPED
-from twirl_mjx.policies.resolve import SCRIPTED_SOURCES, Source, resolve_policy
+from twirl_mjx.policies.resolve import SCRIPTED_SOURCES, Source, check_acts, resolve_policy
 from twirl_mjx.replay import dataset, ring
 from twirl_mjx.training import loop, rundir, source_rules
 from twirl_mjx.training.checkpoint import load_replay
@@ -216,6 +216,8 @@ def check_early(
     if config.variant == "scratch" and source is not None:
         raise ValueError("variant scratch uses no source (nearest: variant 'twirl')")
     source_rules.check_source_is_used(config, preset)
+    if config.variant not in ("scratch", "twirl") and source is None:
+        check_acts(config.source)  # networks, or a policy to evaluate, are asked for
     config.make_task()  # refuses options that only the task can judge
     config.evaluation.make_task()
     if config.variant != "scratch" and source is None:
