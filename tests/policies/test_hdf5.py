@@ -180,6 +180,7 @@ ENDS = rows_of((3, 4))["terminals"]
         (lambda path: write(path, rows_of((3, 4)), task=""), "a task that the file does not name"),
         (lambda path: write(path, rows_of((3, 4)), control_dt=0.02),
          r"control_dt is 0\.02 s, robot a1 acts every 0\.05 s"),
+        (lambda path: write(path, {k: v[:0] for k, v in rows_of((3, 4)).items()}), "0 transitions"),
         (lambda path: write(path, {"episode_0/actions": np.zeros((7, 12))}),
          "episode_0: there is no array 'terminations'"),
     ],

@@ -218,6 +218,8 @@ def _checked(
     """Return the fields of a recording that are there, after checking shapes and numbers."""
     name, found = recording.name, {}
     count = recording.arrays["action"].shape[:1] if "action" in recording.arrays else ()
+    if count and count[0] < 2:
+        raise DatasetError(f"{name}: {count[0]} transitions, need at least 2")
     for field, row in shapes.items():
         if (array := recording.arrays.get(field)) is None:
             if field in optional:
@@ -243,8 +245,6 @@ def _checked(
             odd = array[~np.isin(array, (0, 1))][0]
             raise DatasetError(f"{name}: {field} holds {odd}, need 0 or 1")
         found[field] = array
-    if len(found["action"]) < 2:
-        raise DatasetError(f"{name}: {len(found['action'])} transitions, need at least 2")
     if "terminated" in found and found["terminated"].all():
         raise DatasetError(
             f"{name}: every row is terminated, so nothing would be bootstrapped (a mask of rows"

@@ -43,6 +43,8 @@ MINARI_FILE = "main_data.hdf5"
 WHAT = "a source dataset"
 OUR_WORLDS = "twirl_mjx.worlds.adapters:to_gymnasium"
 """Entry point by which gymnasium makes the tasks of this project."""
+PLAIN_WORLDS = {"task", "shift", "engine", "render_mode"}
+"""Its settings that leave a task's rewards as they are; with others the dataset is a stranger's."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -128,7 +130,7 @@ def find_minari(name: str) -> tuple[Path, dict[str, Any]]:
             " 'hdf5', data_format='hdf5' when it is made)"
         )
     spec = dataset.spec.env_spec
-    if spec is None or spec.entry_point != OUR_WORLDS:
+    if spec is None or spec.entry_point != OUR_WORLDS or spec.kwargs.keys() - PLAIN_WORLDS:
         return path, {}
     return path, dict(spec.kwargs)
 
