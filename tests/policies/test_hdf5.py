@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import json
 import os
 import subprocess
 import sys
@@ -165,6 +166,7 @@ ENDS = rows_of((3, 4))["terminals"]
         (cut, "not a readable HDF5 file"),
         (text, "not a readable HDF5 file"),
         (inside(observations=np.full((7, 101), np.nan)), "obs is not finite in row 0"),
+        (inside(rewards=np.full(7, 1e300)), "reward is not finite in row 0"),
         (inside(observations=np.zeros((7, 48))), r"obs has shape \(7, 48\), .* needs \(7, 101\)"),
         (inside(actions=np.zeros((6, 12))), r"obs has shape \(7, 101\), .* needs \(6, 101\)"),
         (inside(actions=np.float64(1.0)), r"action has shape \(\), task biped needs \('n', 12\)"),
@@ -176,8 +178,9 @@ ENDS = rows_of((3, 4))["terminals"]
         (inside(observations=None, **{"observations/camera": np.zeros((7, 9))}),
          r"obs is a group of 1 arrays \(observations/camera, \.\.\.\), need one array"),
         (lambda path: write(path, rows_of((3, 4)), task="stand"),
-         r"rewards are those of task stand, and it holds no states .* task='biped' in the file"),
-        (lambda path: write(path, rows_of((3, 4)), task=""), "a task that the file does not name"),
+         r"rewards are those of task stand, and it holds no states .*nearest: the states too\)"),
+        (lambda path: write(path, rows_of((3, 4)), task=""),
+         r"a task that the file does not name.*, or task='biped' in the file"),
         (lambda path: write(path, rows_of((3, 4)), control_dt=0.02),
          r"control_dt is 0\.02 s, robot a1 acts every 0\.05 s"),
         (lambda path: write(path, {k: v[:0] for k, v in rows_of((3, 4)).items()}), "0 transitions"),
@@ -230,8 +233,11 @@ def test_a_dataset_of_minari_that_is_not_there(monkeypatch: pytest.MonkeyPatch) 
         list_local_datasets=lambda: {"a1/trot-v0": {}, "door/human-v2": {}},
     )
     monkeypatch.setitem(sys.modules, "minari", fake)
-    with pytest.raises(FileNotFoundError, match=r"no such dataset .*\(nearest: 'a1/trot-v0'\)"):
+    with pytest.raises(FileNotFoundError, match=r"not on this machine .*\(nearest: 'a1/trot-v0'\)"):
         resolve_policy("minari:a1/trott-v0", CONFIG)
+    fake.load_dataset = lambda identity: json.loads("{")
+    with pytest.raises(FileNotFoundError, match=r"minari:x cannot be read \(Expecting property"):
+        resolve_policy("minari:x", CONFIG)
     assert rows.is_recording("minari:a1/trott-v0")
 
 

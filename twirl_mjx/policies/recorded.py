@@ -119,11 +119,14 @@ def read(name: str, config: WorldConfig) -> tuple[Transition, str, tuple[str, ..
     if "qpos" in recording.arrays and "qvel" in recording.arrays:
         data, notes = _from_states(recording, config, robot)
         return data, recording.digest, notes
-    where = f"task {recording.task}" if recording.task else "a task that the file does not name"
+    where, remedy = f"task {recording.task}", "the states too"
+    if not recording.task:
+        where = "a task that the file does not name"
+        remedy += f", or task='{config.task}' in the file if that is where it was recorded"
     raise DatasetError(
         f"{name}: its rewards are those of {where}, and it holds no states (qpos [n,"
-        f" {ROOT_SIZE + robot.num_joints}] and qvel) for task {config.task} to judge (nearest: the"
-        f" states too, or task='{config.task}' in the file if that is where it was recorded)"
+        f" {ROOT_SIZE + robot.num_joints}] and qvel) for task {config.task} to judge (nearest:"
+        f" {remedy})"
     )
 
 
@@ -238,7 +241,9 @@ def _checked(
             )
         if array.dtype.kind not in "fiub":
             raise DatasetError(f"{name}: {field} is of type {array.dtype}, need numbers")
-        bad = ~np.isfinite(array.astype(np.float64)).reshape(len(array), -1).all(axis=1)
+        with np.errstate(over="ignore"):  # what is too large for float32 is not finite there
+            numbers = array.astype(np.float32)
+        bad = ~np.isfinite(numbers).reshape(len(array), -1).all(axis=1)
         if bad.any():
             raise DatasetError(f"{name}: {field} is not finite in row {int(np.argmax(bad))}")
         if field in ("terminated", "truncated") and not np.isin(array, (0, 1)).all():

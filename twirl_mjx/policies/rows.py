@@ -118,11 +118,10 @@ def find_minari(name: str) -> tuple[Path, dict[str, Any]]:
             known = sorted(minari.list_local_datasets())
         except Exception:
             known = []
-        raise FileNotFoundError(
-            f"{name}: there is no such dataset on this machine that can be read"
-            f" ({' '.join(str(error).split())}): {choose_one(identity, known)}; `minari download`"
-            " fetches published ones"
-        ) from error
+        why = f"cannot be read ({' '.join(str(error).split())})"
+        if isinstance(error, FileNotFoundError):
+            why = "is not on this machine (`minari download` fetches published datasets)"
+        raise FileNotFoundError(f"{name} {why}: {choose_one(identity, known)}") from error
     path = Path(dataset.storage.data_path) / MINARI_FILE
     if not path.is_file():
         raise DatasetError(
