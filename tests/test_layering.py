@@ -28,7 +28,7 @@ ALLOWED: dict[str, set[str]] = {
     "exits": set(),
     "assets": set(),
     "files": {"checks"},
-    "array_files": {"files"},
+    "array_files": {"files", "plugins"},
     "faults": {"exits"},
     "plugins": {"checks", "files"},
     "records": {"checks"},

@@ -1,7 +1,8 @@
 """Arrays in files: written whole or not at all, read without pickles and without surprises.
 
 What an archive and the headers of its arrays declare is compared with what the file holds before
-anything is allocated. Everything else about files: ``files``.
+anything is allocated. HDF5 files are read the same way, and nothing beside them is opened.
+Everything else about files: ``files``.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from twirl_mjx import files
+from twirl_mjx import files, plugins
 
 MAX_RATIO = 100
 """Arrays of more than 64 MB may be compressed to this share at best: zeros only are smaller."""
@@ -89,6 +90,50 @@ def names_in_npz(path: str | Path, what: str) -> frozenset[str]:
             raise ValueError("it holds one array, not an archive")
         with zipfile.ZipFile(file) as archive:
             return frozenset(name.removesuffix(".npy") for name in archive.namelist())
+
+
+def read_hdf5(path: str | Path, what: str, limit: int = files.SIZE_LIMIT) -> dict[str, np.ndarray]:
+    """Return the arrays of numbers of an HDF5 file by their path within it, ``group/name``.
+
+    Numbers and texts among the attributes of the file itself are arrays of no dimension. The sizes
+    that are declared are compared as in :func:`read_npz`. Links are refused, and so are arrays
+    whose bytes lie in other files. Texts and arrays of other types are left out.
+
+    Raises:
+        FileError: As :func:`check_readable`, no such file, or one that cannot be trusted.
+        ValueError: The package h5py is not installed.
+    """
+    size = files.check_readable(path, what, limit)
+    h5py = plugins.required("h5py", f"{path}: an HDF5 file", "hdf5")
+    with _named(path, "HDF5 file", what), h5py.File(path, "r") as file:
+        found = dict(_hdf5_arrays(h5py, file, "", set()))
+        total = sum(math.prod(item.shape) * item.dtype.itemsize for item in found.values())
+        if total > min(limit, max(64 * files.MB, MAX_RATIO * size)):
+            raise ValueError(f"{size:,} bytes that would become {total:,}")
+        said = {k: np.asarray(v) for k, v in file.attrs.items()}
+        plain = {name: value for name, value in said.items() if value.dtype.kind in "biufU"}
+        return plain | {name: item[()] for name, item in found.items()}
+
+
+def _hdf5_arrays(h5py: Any, group: Any, above: str, seen: set[int]) -> Iterator[tuple[str, Any]]:
+    """Yield path and array of all numbers under a group, each object once."""
+    for name in group:
+        where, link = f"{above}{name}", group.get(name, getlink=True)
+        if not isinstance(link, h5py.HardLink):
+            raise ValueError(f"{where} is a link to {link.path!r}, and links are not followed")
+        item = group[name]
+        address = h5py.h5o.get_info(item.id).addr
+        if address in seen:
+            raise ValueError(f"{where} is another name of an object that was there before")
+        seen.add(address)
+        if isinstance(item, h5py.Group):
+            yield from _hdf5_arrays(h5py, item, f"{where}/", seen)
+        elif (
+            isinstance(item, h5py.Dataset) and item.dtype.kind in "biuf" and item.shape is not None
+        ):
+            if item.external or item.is_virtual:
+                raise ValueError(f"the numbers of {where} lie in another file, which is not opened")
+            yield where, item
 
 
 def _read_array(file: Any, size: int) -> np.ndarray:

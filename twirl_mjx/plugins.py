@@ -67,6 +67,26 @@ def load(reference: str, kind: str = "object") -> Any:
     return getattr(module, name)
 
 
+def required(package: str, purpose: str, extra: str = "") -> ModuleType:
+    """Import an optional package.
+
+    Args:
+        package: Its name.
+        purpose: What needs it, the beginning of the message.
+        extra: The extra of this project that brings it, by default of the same name.
+
+    Raises:
+        ValueError: It is not installed; the message says what to install.
+    """
+    try:
+        return importlib.import_module(package)
+    except ImportError as error:
+        raise ValueError(
+            f"{purpose} needs the package {package}, which is not installed: pip install"
+            f" 'twirl-mjx[{extra or package}]' ({error})"
+        ) from error
+
+
 def _module(path: Path) -> ModuleType:
     name = f"_twirl_{path.stem}_{hashlib.sha256(str(path).encode()).hexdigest()[:8]}"
     if name in sys.modules:

@@ -28,7 +28,7 @@ from twirl_mjx.worlds.config import WorldConfig
 EXAMPLE = Path(__file__).parents[2] / "examples" / "deploy.py"
 
 
-@pytest.mark.parametrize("task", ["stand", "biped", "hurdles"])
+@pytest.mark.parametrize("task", ["stand", "biped", "hurdles", "imitate"])
 def test_the_example_reproduces_a_rehearsal(task: str, tmp_path: Path) -> None:
     """Noise, latency and all: what was measured goes in, actions and joint targets come out."""
     exported = export(asset_path("policies", f"{task}.npz"), tmp_path / "policy.onnx").onnx

@@ -9,6 +9,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import h5py
 import numpy as np
 import pytest
 
@@ -16,13 +17,17 @@ from twirl_mjx.commands import collect, evaluate, render
 from twirl_mjx.commands.curriculum import CurriculumOptions
 from twirl_mjx.commands.curriculum import plan as chain
 from twirl_mjx.commands.options import parse_collect, parse_train
+from twirl_mjx.deploy.rehearsal import rehearse
 from twirl_mjx.policies import ready
 from twirl_mjx.policies.contract import ContractError
 from twirl_mjx.policies.meeting import ContractPolicy
+from twirl_mjx.sim.robots import A1
 from twirl_mjx.sweep import plan
 from twirl_mjx.sweep.grid import load
+from twirl_mjx.tasks.observations import layout_slices
 from twirl_mjx.training import pipeline
 from twirl_mjx.training.config import TrainConfig
+from twirl_mjx.training.presets import make_config
 
 
 @pytest.fixture
@@ -132,4 +137,71 @@ def test_a_contract_that_does_not_fit_is_refused_before_anything_runs(
     wrong: TrainConfig = dataclasses.replace(config, **change)  # type: ignore[arg-type]
     with pytest.raises(ContractError):
         pipeline.run(wrong, "debug", tmp_path / "runs", "x", print)
+    assert not (tmp_path / "runs").exists()
+
+
+@pytest.fixture
+def recording(tmp_path: Path) -> str:
+    """Return an HDF5 file with three rows of ``biped``."""
+    obs = np.zeros((4, 101))
+    layout = make_config("biped", "debug").make_task().observer.layout
+    for name, part in layout_slices(layout).items():
+        if name.startswith("joint_pos"):
+            obs[:, part] = A1.default_pose
+        if name in ("base_x_axis_w", "base_z_axis_w"):
+            obs[:, part] = [1.0, 0.0, 0.0]
+    obs[:, 0] = np.arange(4)
+    with h5py.File(tmp_path / "data.hdf5", "w") as file:
+        file.attrs["task"] = "biped"
+        zeros = np.zeros(3)
+        rows = {"observations": obs, "actions": np.zeros((3, 12)), "rewards": zeros}
+        for name, array in (rows | {"terminations": zeros, "truncations": zeros}).items():
+            file[f"episode_0/{name}"] = array
+    return str(tmp_path / "data.hdf5")
+
+
+def test_recorded_data_train(recording: str, tmp_path: Path) -> None:
+    """In train, collect, a sweep and a curriculum."""
+
+    def check_data(config: TrainConfig) -> None:
+        pipeline.check_early(config, "debug", pipeline.RunDir(tmp_path / "run"))
+        data = pipeline.find_source(config, "debug", tmp_path, print).data
+        assert data is not None
+        np.testing.assert_array_equal(data.next_obs[:, 0], [1, 2, 3])
+
+    words = ["--task", "biped", "--preset", "debug", "--source", recording]
+    check_data(parse_train(words).config)
+    check_data(parse_collect(words).config)
+    module = tmp_path / "grid.py"
+    module.write_text(
+        f"""
+GRID = ({{"preset": "debug", "seeds": (0,),
+         "axes": {{"arm": {{"data": {{"task": "biped", "source": {recording!r}}}}}}}}},)
+REDUCED = GRID
+REDUCED_NOTE = "a test"
+"""
+    )
+    (cell,) = plan.make_plan(load(str(module)), tmp_path)
+    check_data(parse_train(plan.arguments(cell, tmp_path)[1:]).config)
+    options = CurriculumOptions(task="biped", runs=tmp_path, source=recording, shifts=())
+    ((_, first),) = chain(options, "debug")
+    assert first.variant == "twirl"
+    check_data(first)
+
+
+def test_recorded_data_do_not_act(recording: str, tmp_path: Path) -> None:
+    """Said before they are read, or any world is made."""
+    words = "is recorded data, which does not act"
+    with pytest.raises(ValueError, match=words):
+        evaluate.resolve_all(evaluate.EvaluateOptions((recording,), task="biped"), {})
+    with pytest.raises(ValueError, match=words):
+        film = [recording, "--task", "biped", "--out", str(tmp_path / "film")]
+        render.main(film, lambda draws: None)
+    with pytest.raises(ValueError, match=words):
+        rehearse(recording, task="biped")
+    config = parse_train(["--task", "biped", "--preset", "debug", "--source", recording]).config
+    for variant in ("zero-shot", "weights", "twirl+weights"):
+        asked = dataclasses.replace(config, variant=variant)
+        with pytest.raises(ValueError, match=words):
+            pipeline.run(asked, "debug", tmp_path / "runs", "x", print)
     assert not (tmp_path / "runs").exists()

@@ -9,7 +9,7 @@ import jax
 import numpy as np
 import pytest
 
-from twirl_mjx.policies import recorded
+from twirl_mjx.policies import rows
 from twirl_mjx.policies.resolve import Terms, resolve_policy
 from twirl_mjx.replay import dataset
 from twirl_mjx.replay.dataset import DatasetError
@@ -32,9 +32,12 @@ def arrays(count: int = 6) -> dict[str, Any]:
             obs[:, part] = A1.default_pose + 0.1 * rng.standard_normal((count + 1, 12))
         if name in ("base_x_axis_w", "base_z_axis_w"):
             obs[:, part] = [1.0, 0.0, 0.0]
+    actions = rng.uniform(-1, 1, (count, 12))
+    obs[1:, PARTS["previous_action[0]"]] = actions
     return {
+        "task": "biped",
         "observations": obs[:-1],
-        "actions": rng.uniform(-1, 1, (count, 12)),
+        "actions": actions,
         "rewards": np.arange(count, dtype=np.float64)[:, None],
         "terminals": np.arange(count) == 3,
         "timeouts": np.arange(count) == 5,
@@ -94,14 +97,14 @@ def entry(name: str, value: Any, row: int = 2) -> dict[str, Any]:
         ({"rewards": np.zeros(5)}, r"reward has shape \(5,\)"),
         ({"rewards": np.array([0, 0, np.nan, 0, 0, 0])}, "reward is not finite in row 2"),
         ({"rewards": np.array(["a"] * 6)}, "of type <U1, need numbers"),
-        ({"rewards": None}, "no array 'reward' among"),
+        ({"rewards": None}, "no array 'reward' .* among action, "),
         (
             {"terminals": None, "dones": np.zeros(6)},
             "'dones' mix ends of the task with time limits",
         ),
         ({"terminals": np.full(6, 2)}, "terminated holds 2"),
         ({"terminals": np.ones(6)}, "every row is terminated"),
-        ({"timeouts": np.zeros(4)}, r"timeouts has shape \(4,\)"),
+        ({"timeouts": np.zeros(4)}, r"truncated has shape \(4,\)"),
         (
             {"actions": np.full((6, 12), 1.8)},
             r"action reaches 1\.8 in row 0, limit 1 \(joint angles",
@@ -120,14 +123,14 @@ def test_what_cannot_be_of_the_task_is_refused(changes: dict, message: str, tmp_
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("name", ["d.hdf5", "d.h5", "minari:D4RL/door/human-v2", "d.pkl", "d.pt"])
+@pytest.mark.parametrize("name", ["d.pkl", "d.pt"])
 def test_formats_that_are_not_read_are_named(name: str) -> None:
-    with pytest.raises(DatasetError, match=r"is not read, because .*nearest: .*numpy\.savez"):
+    with pytest.raises(DatasetError, match=r"is not read, because .*nearest: .* \.npz or \.hdf5"):
         resolve_policy(name, CONFIG.evaluation)
 
 
 def test_a_policy_file_is_no_recording(tmp_path: Path) -> None:
     from twirl_mjx.assets import asset_path
 
-    assert not recorded.is_recording(asset_path("policies", "biped.npz"))
-    assert not recorded.is_recording(tmp_path)
+    assert not rows.is_recording(str(asset_path("policies", "biped.npz")))
+    assert not rows.is_recording(str(tmp_path))

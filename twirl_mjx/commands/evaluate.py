@@ -154,7 +154,7 @@ def resolve_all(options: EvaluateOptions, overrides: Overrides) -> list[Candidat
         ValueError: A file that is no policy, options of another task, or two policies that the
             table could not tell apart.
     """
-    from twirl_mjx.policies.resolve import PLAIN, Terms, resolve_policy, takes_terms
+    from twirl_mjx.policies.resolve import PLAIN, Terms, resolve_actor, takes_terms
 
     terms = Terms(options.source_contract, options.source_command, options.allow_clipping)
     pairs = [named(word) for word in options.policies]
@@ -170,11 +170,7 @@ def resolve_all(options: EvaluateOptions, overrides: Overrides) -> list[Candidat
         config = dataclasses.replace(config, course=options.course, engine=options.engine)
         config.make_task()  # refuses options that only the task can judge
         its = terms if given in foreign or not foreign else PLAIN  # refused where nobody is foreign
-        found = resolve_policy(given, config, terms=its)
-        if found.data is not None:
-            raise ValueError(
-                f"{given} is recorded data, which does not act (nearest: the policy behind it)"
-            )
+        found = resolve_actor(given, config, terms=its)
         for note in found.notes:
             say(f"{given}: {note}")
         candidates[run] = Candidate(given, run, config, found)

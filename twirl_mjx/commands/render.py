@@ -96,11 +96,11 @@ def stem_of(path: Path) -> Path:
 def record(config: WorldConfig, options: RenderOptions) -> Recording:
     """Return one episode of a policy, and say what should be known of it."""
     from twirl_mjx.evaluation.record import record_episode
-    from twirl_mjx.policies.resolve import Terms, resolve_policy
+    from twirl_mjx.policies.resolve import Terms, resolve_actor
     from twirl_mjx.sim.robots import ROBOTS
 
     terms = Terms(options.source_contract, options.source_command, options.allow_clipping)
-    found = resolve_policy(options.policy, config, terms=terms)
+    found = resolve_actor(options.policy, config, terms=terms)
     for note in found.notes:
         say(f"{options.policy}: {note}")
     steps = min(config.episode_length, round(options.seconds / ROBOTS.get(config.robot).control_dt))

@@ -25,7 +25,7 @@ from twirl_mjx.policies.resolve import (
     Terms,
     header_of,
     options_of_card,
-    resolve_policy,
+    resolve_actor,
     robot_of_card,
 )
 from twirl_mjx.sim.robots import A1
@@ -169,11 +169,7 @@ def find_pilot(
         return OwnPilot(policy, task, options), task
     if is_own:
         return OwnPilot(load_policy(policy), task, options), task
-    source = resolve_policy(str(policy), WorldConfig(task=task, options=options), terms=terms)
-    if source.data is not None:
-        raise ValueError(
-            f"{policy} is recorded data, which does not act (nearest: the policy behind it)"
-        )
+    source = resolve_actor(str(policy), WorldConfig(task=task, options=options), terms=terms)
     for note in source.notes:
         say(f"{policy}: {note}")
     return SourcePilot(source.policy, task, options), task

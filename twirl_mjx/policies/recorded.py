@@ -1,13 +1,12 @@
 """A source that is only a recording: transitions of the target task from a file.
 
-Read are this project's own datasets (``source.npz`` of any run) and plain ``.npz`` files with the
-arrays of ``NAMES``. Rewards are taken as they are recorded, so they have to be those of the target
-task; that cannot be checked without the states, which observations do not hold.
+Read are this project's own datasets (``source.npz`` of any run) and the files of ``rows``. Where a
+file says that it was recorded in the target task, it is taken at its word. Otherwise its rewards
+mean nothing here: it needs physics states, which the target task observes and judges anew.
 """
 
 from __future__ import annotations
 
-import hashlib
 import math
 from collections.abc import Mapping
 from pathlib import Path
@@ -18,30 +17,30 @@ import jax.numpy as jnp
 import numpy as np
 
 from twirl_mjx import array_files, files
-from twirl_mjx.checks import choose_one
+from twirl_mjx.policies import rows
+from twirl_mjx.policies.rows import Recording
 from twirl_mjx.replay import dataset
 from twirl_mjx.replay.dataset import DatasetError
-from twirl_mjx.sim.robot import Robot
+from twirl_mjx.sim.robot import ROOT_SIZE, Robot
+from twirl_mjx.sim.robots import ROBOTS
 from twirl_mjx.tasks.observations import Entry, layout_size, layout_slices
 from twirl_mjx.types import Transition
+from twirl_mjx.worlds import judging
+from twirl_mjx.worlds.config import WorldConfig
+from twirl_mjx.worlds.make import make_env
 
-NAMES: dict[str, tuple[str, ...]] = {
-    "obs": ("obs", "observations"),
-    "action": ("action", "actions"),
-    "reward": ("reward", "rewards"),
-    "terminated": ("terminated", "terminals", "terminations"),
-    "next_obs": ("next_obs", "next_observations"),
-}
-"""Field -> names its array may have."""
-TRUNCATIONS = ("truncated", "truncations", "timeouts")
-"""Time limits; read for their shape and not needed: a truncated row bootstraps like any other."""
 LIMIT_MARGIN = 0.2
 """rad, by which recorded joint angles may lie outside the limits: contacts and impacts do that."""
 UNIT_TOLERANCE = 0.02
 """Largest deviation of a recorded unit vector or quaternion from length 1."""
+MAX_HEIGHT = 3.0
+"""m, of a recorded base over the ground."""
+RATE_TOLERANCE = 1.5
+"""Largest ratio between the time that positions and velocities say lies between states, and a
+control step."""
+LEAST_SPEED = 0.05
+"""m/s, root mean square from which on that time can be told."""
 FOREIGN_FORMATS = {
-    ".hdf5": "h5py is not among the packages of this project",
-    ".h5": "h5py is not among the packages of this project",
     ".pt": "torch is not among the packages of this project",
     ".pkl": "a pickle runs code when it is read",
     ".pickle": "a pickle runs code when it is read",
@@ -81,148 +80,298 @@ def refuse_format(name: str) -> None:
         DatasetError: ``name`` is of such a format.
     """
     reason = FOREIGN_FORMATS.get(Path(name).suffix)
-    if name.startswith("minari:"):
-        reason = "minari and h5py are not among the packages of this project"
     if reason:
-        arrays = ", ".join(names[0] for names in NAMES.values())
         raise DatasetError(
-            f"{name} is not read, because {reason} (nearest: the same arrays in an .npz file:"
-            f" numpy.savez('data.npz', {arrays}))"
+            f"{name} is not read, because {reason} (nearest: its arrays in an .npz or .hdf5 file,"
+            " docs/sources.md)"
         )
 
 
-def is_recording(path: Path) -> bool:
-    """Return whether a file is an archive of transitions rather than a policy."""
-    if path.suffix != ".npz" or not path.is_file():
-        return False
-    names = array_files.names_in_npz(path, "a source")
-    return any(name in names for name in NAMES["obs"] + NAMES["action"])
-
-
-def read(
-    path: Path, *, task: str, layout: tuple[Entry, ...], robot: Robot
-) -> tuple[Transition, str, str]:
+def read(name: str, config: WorldConfig) -> tuple[Transition, str, tuple[str, ...]]:
     """Read transitions and check them against the target task.
 
     Args:
-        path: The file.
-        task: Name of the target task.
-        layout: What it shows.
-        robot: Who acts there.
+        name: A file, or ``minari:ID``.
+        config: Worlds of the target task.
 
     Returns:
-        Transitions [n, ...] as numpy arrays; a digest of the file; the shift it was recorded
-        under ("" where the file does not say).
+        Transitions [n, ...] as numpy arrays; a digest of the file; what a person should know.
 
     Raises:
-        DatasetError: Sizes, ranges or values that cannot be of this task; the message names the
-            array, the row and the likely mistake.
+        FileNotFoundError: There is no such file or dataset.
+        ValueError: It cannot be read, or its sizes, ranges or values cannot be of this task; the
+            message names the array, the row and the likely mistake.
     """
+    robot, layout = ROBOTS.get(config.robot), config.make_task().observer.layout
     sizes = {"observation_size": layout_size(layout), "action_size": robot.num_joints}
-    digest = hashlib.sha256(files.read_bytes(path, "a source dataset")).hexdigest()[:12]
-    if "header" in array_files.names_in_npz(path, "a source dataset"):
-        header, data = dataset.read(path, task=task, **sizes)
-        data, shift = jax.tree.map(np.asarray, data), header.shift
-    else:
-        data, shift = _plain(path, sizes["observation_size"], sizes["action_size"], task), ""
-    for name in ("obs", "next_obs"):
-        _check_observations(path, name, getattr(data, name), layout, robot)
-    return data, digest, shift
-
-
-def _plain(path: Path, observation_size: int, action_size: int, task: str) -> Transition:
-    arrays = array_files.read_npz(path, "a source dataset")
-    found = {field: _find(path, arrays, field) for field in NAMES}
-    count = len(found["obs"]) if found["obs"].ndim else 0
-    shapes = {
-        "obs": (count, observation_size),
-        "action": (count, action_size),
-        "reward": (count,),
-        "terminated": (count,),
-        "next_obs": (count, observation_size),
-    }
-    for field, shape in shapes.items():
-        array = found[field]
-        if field in ("reward", "terminated") and array.shape == (count, 1):
-            array = found[field] = array[:, 0]
-        if array.shape != shape:
-            raise DatasetError(
-                f"{path}: {field} has shape {array.shape}, task {task} needs {shape}: observations"
-                f" of {observation_size} numbers as {task} shows them, {action_size} joints"
-            )
-        if array.dtype.kind not in "fiub":
-            raise DatasetError(f"{path}: {field} is of type {array.dtype}, need numbers")
-        with np.errstate(over="ignore"):  # what float32 cannot hold is infinite
-            bad = ~np.isfinite(array.astype(np.float32)).reshape(count, -1).all(axis=1)
-        if bad.any():
-            raise DatasetError(f"{path}: {field} is not finite in row {int(np.argmax(bad))}")
-    if count < 2:
-        raise DatasetError(f"{path}: {count} transitions, need at least 2")
-    _check_values(path, found)
-    for name in TRUNCATIONS:
-        if name in arrays and arrays[name].reshape(-1).shape != (count,):
-            raise DatasetError(f"{path}: {name} has shape {arrays[name].shape}, need ({count},)")
-    values: dict[str, Any] = {
-        "obs": found["obs"].astype(np.float32),
-        "action": np.clip(found["action"], -1.0, 1.0).astype(np.float32),
-        "reward": found["reward"].astype(np.float32),
-        "terminated": found["terminated"].astype(bool),
-        "next_obs": found["next_obs"].astype(np.float32),
-    }
-    return Transition(**values)
-
-
-def _find(path: Path, arrays: Mapping[str, np.ndarray], field: str) -> np.ndarray:
-    for name in NAMES[field]:
-        if name in arrays:
-            return arrays[name]
-    if field == "terminated" and {"done", "dones"} & arrays.keys():
-        raise DatasetError(
-            f"{path}: 'dones' mix ends of the task with time limits, after which learning goes on:"
-            " give terminated and truncated apart"
-        )
+    path = Path(name)
+    if path.suffix == ".npz" and "header" in array_files.names_in_npz(path, rows.WHAT):
+        header, data = dataset.read(path, task=config.task, **sizes)
+        data, digest = jax.tree.map(np.asarray, data), files.checksum(path)[:12]
+        _check_observations(name, data, layout, robot)
+        return data, digest, _said(header.shift, config)
+    recording = rows.load(name)
+    _check_rate(recording, robot)
+    if recording.task == config.task:
+        data, notes = _as_recorded(recording, **sizes)
+        _check_observations(name, data, layout, robot)
+        return data, recording.digest, (*_said(recording.shift, config), *notes)
+    if "qpos" in recording.arrays and "qvel" in recording.arrays:
+        data, notes = _from_states(recording, config, robot)
+        return data, recording.digest, notes
+    where, remedy = f"task {recording.task}", "the states too"
+    if not recording.task:
+        where = "a task that the file does not name"
+        remedy += f", or task='{config.task}' in the file if that is where it was recorded"
     raise DatasetError(
-        f"{path}: there is no array {NAMES[field][0]!r} among {', '.join(sorted(arrays))};"
-        f" {choose_one(field, NAMES[field])}"
+        f"{name}: its rewards are those of {where}, and it holds no states (qpos [n,"
+        f" {ROOT_SIZE + robot.num_joints}] and qvel) for task {config.task} to judge (nearest:"
+        f" {remedy})"
     )
 
 
-def _check_values(path: Path, found: Mapping[str, np.ndarray]) -> None:
-    largest = float(np.abs(found["action"]).max())
-    if largest > 1.0 + 1e-6:
-        row = int(np.argmax(np.abs(found["action"]).max(axis=1)))
+def _said(shift: str, config: WorldConfig) -> tuple[str, ...]:
+    notes = (f"its rewards are taken as they were recorded in task {config.task}",)
+    if shift and shift != config.shift:
+        notes += (f"it was recorded under shift {shift}, this is shift {config.shift}",)
+    return notes
+
+
+def _check_rate(recording: Recording, robot: Robot) -> None:
+    said, here = recording.control_dt, robot.control_dt
+    if said is not None and not abs(said - here) <= 1e-3 * here:
         raise DatasetError(
-            f"{path}: action reaches {largest:.3g} in row {row}, limit 1 (joint angles, or outputs"
-            " in units of another action scale? An action is (target - default pose) / half range)"
+            f"{recording.name}: control_dt is {said:g} s, robot {robot.name} acts every {here:g} s:"
+            " an action of another rate is another action (nearest: the policy behind it, asked at"
+            " this rate)"
         )
-    ends = found["terminated"]
-    if not np.isin(ends, (0, 1)).all():
-        raise DatasetError(f"{path}: terminated holds {ends[~np.isin(ends, (0, 1))][0]}, need 0, 1")
-    if ends.all():
+
+
+def _as_recorded(
+    recording: Recording, observation_size: int, action_size: int
+) -> tuple[Transition, tuple[str, ...]]:
+    """Return observations, rewards and ends as they stand in the file."""
+    name = recording.name
+    shapes = {
+        "action": (action_size,),
+        "obs": (observation_size,),
+        "reward": (),
+        "terminated": (),
+        "next_obs": (observation_size,),
+        "truncated": (),
+    }
+    found = _checked(recording, recording.task, shapes, ("next_obs", "truncated"))
+    _check_action(name, found["action"])
+    found, keep = _with_successors(name, found, "obs")
+    if np.array_equal(found["obs"], found["next_obs"]):
+        raise DatasetError(f"{name}: next_obs equals obs in every row: nothing ever moved")
+    values: dict[str, Any] = {
+        field: found[field][keep].astype(bool if field == "terminated" else np.float32)
+        for field in dataset.FIELDS
+    }
+    values["action"] = np.clip(values["action"], -1.0, 1.0)
+    return Transition(**values), _left_out(keep)
+
+
+def _left_out(keep: np.ndarray) -> tuple[str, ...]:
+    count = int((~keep).sum())
+    why = "nothing in the file says what followed them"
+    return (f"{count:,} of {len(keep):,} rows are left out, because {why}",) if count else ()
+
+
+def _from_states(
+    recording: Recording, config: WorldConfig, robot: Robot
+) -> tuple[Transition, tuple[str, ...]]:
+    """Return what the target task makes of the states of a file."""
+    name, joints = recording.name, robot.num_joints
+    qpos, qvel = (ROOT_SIZE + joints,), (ROOT_SIZE - 1 + joints,)
+    shapes: dict[str, tuple[int, ...]] = {
+        "action": (joints,), "qpos": qpos, "qvel": qvel, "next_qpos": qpos, "next_qvel": qvel,
+        "goal": (2,), "terminated": (), "truncated": (),
+    }  # fmt: skip
+    optional = ("next_qpos", "next_qvel", "goal", "terminated", "truncated")
+    found = _checked(recording, config.task, shapes, optional)
+    _check_action(name, found["action"])
+    ends = found.get("terminated", np.zeros(len(found["action"]))).astype(bool)
+    found, keep = _with_successors(name, found | {"terminated": ends}, "qpos", "qvel")
+    for field in ("qpos", "next_qpos"):
+        _check_states(f"{name}: {field}", found[field][keep], robot)
+    ends |= found.get("truncated", ends).astype(bool)
+    first = np.ones(len(keep), bool)
+    goes_on = np.isclose(found["next_qpos"][:-1], found["qpos"][1:], atol=1e-5).all(axis=1)
+    first[1:] = ends[:-1] | ~goes_on
+    fields = ("qpos", "qvel", "next_qpos", "next_qvel", "action")
+    goal = found["goal"][keep] if "goal" in found else None
+    motion = judging.Motion(**{f: found[f][keep] for f in fields}, first=first[keep], goal=goal)
+    _check_spacing(name, motion, robot)
+    key = jax.random.key(int(recording.digest, 16) % 2**31)
+    data, kept = judging.judge(make_env(config, num_envs=1), key, motion)
+    notes = f"task {config.task} observed and judged its states, at the end of every control step"
+    after = int((~kept).sum())
+    ended = (f"{after:,} steps after an end of the task are left out",) if after else ()
+    return jax.tree.map(lambda x: x[kept], data), (notes, *_left_out(keep), *ended)
+
+
+def _checked(
+    recording: Recording,
+    task: str,
+    shapes: Mapping[str, tuple[int, ...]],
+    optional: tuple[str, ...],
+) -> dict[str, np.ndarray]:
+    """Return the fields of a recording that are there, after checking shapes and numbers."""
+    name, found = recording.name, {}
+    count = recording.arrays["action"].shape[:1] if "action" in recording.arrays else ()
+    if count and count[0] < 2:
+        raise DatasetError(f"{name}: {count[0]} transitions, need at least 2")
+    for field, row in shapes.items():
+        if (array := recording.arrays.get(field)) is None:
+            if field in optional:
+                continue
+            raise DatasetError(
+                f"{name}: there is no array {field!r} (names: {', '.join(rows.NAMES[field])}) among"
+                f" {', '.join(sorted(recording.arrays)) or 'none that is known'}"
+            )
+        if not row and array.shape == (*count, 1):
+            array = array[:, 0]
+        if not count or array.shape != (*count, *row):
+            need = (*(count or "n"), *row)
+            raise DatasetError(
+                f"{name}: {field} has shape {array.shape}, task {task} needs {need}: a row per"
+                " action, observations as the task shows them, a number for every joint"
+            )
+        if array.dtype.kind not in "fiub":
+            raise DatasetError(f"{name}: {field} is of type {array.dtype}, need numbers")
+        with np.errstate(over="ignore"):  # what is too large for float32 is not finite there
+            numbers = array.astype(np.float32)
+        bad = ~np.isfinite(numbers).reshape(len(array), -1).all(axis=1)
+        if bad.any():
+            raise DatasetError(f"{name}: {field} is not finite in row {int(np.argmax(bad))}")
+        if field in ("terminated", "truncated") and not np.isin(array, (0, 1)).all():
+            odd = array[~np.isin(array, (0, 1))][0]
+            raise DatasetError(f"{name}: {field} holds {odd}, need 0 or 1")
+        found[field] = array
+    if "terminated" in found and found["terminated"].all():
         raise DatasetError(
-            f"{path}: every row is terminated, so nothing would be bootstrapped (a mask of rows"
+            f"{name}: every row is terminated, so nothing would be bootstrapped (a mask of rows"
             " that go on, inverted?)"
         )
-    if np.array_equal(found["obs"], found["next_obs"]):
-        raise DatasetError(f"{path}: next_obs equals obs in every row: nothing ever moved")
+    return found
+
+
+def _check_action(name: str, action: np.ndarray) -> None:
+    largest = float(np.abs(action).max())
+    if largest > 1.0 + 1e-6:
+        row = int(np.argmax(np.abs(action).max(axis=1)))
+        raise DatasetError(
+            f"{name}: action reaches {largest:.3g} in row {row}, limit 1 (joint angles, or outputs"
+            " in units of another action scale? An action is (target - default pose) / half range)"
+        )
+
+
+def _with_successors(
+    name: str, found: dict[str, np.ndarray], *fields: str
+) -> tuple[dict[str, np.ndarray], np.ndarray]:
+    """Return the arrays with ``next_*`` of every field, and which rows [n] have a successor.
+
+    Where the file does not have them they are taken from the next row, and the last row of an
+    episode has none: never the first row of the next episode. An observation of which the task
+    ended needs no successor: nothing is bootstrapped from it.
+    """
+    keep = np.ones(len(found["action"]), bool)
+    for field in fields:
+        if f"next_{field}" in found:
+            continue
+        if "truncated" not in found:
+            raise DatasetError(
+                f"{name}: it has neither next_{field} nor the ends of its episodes: give"
+                f" truncated ({', '.join(rows.NAMES['truncated'][1:])}) or next_{field}"
+            )
+        terminated = found["terminated"].astype(bool)
+        ends = terminated | found["truncated"].astype(bool)
+        ends[-1] = True
+        following = np.concatenate([found[field][1:], found[field][-1:]])
+        if field == "obs":
+            following[terminated] = found[field][terminated]
+            ends &= ~terminated
+        found = found | {f"next_{field}": following}
+        keep &= ~ends
+    if keep.sum() < 2:
+        raise DatasetError(f"{name}: {keep.sum()} rows have a successor, need at least 2")
+    return found, keep
+
+
+def _check_states(where: str, qpos: np.ndarray, robot: Robot) -> None:
+    """Check configurations [n, 7 + J]: position in m, orientation w x y z, joints in rad."""
+    length = np.linalg.norm(qpos[:, 3:7], axis=1)
+    row = int(np.argmax(np.abs(length - 1.0)))
+    if abs(length[row] - 1.0) > UNIT_TOLERANCE:
+        raise DatasetError(
+            f"{where}: the quaternion has length {length[row]:.3g} in row {row}, need 1 (another"
+            " order: position, then w x y z, then joints?)"
+        )
+    low, high = robot.joint_limits.T
+    _check_range(
+        where, qpos[:, 7:], low - LIMIT_MARGIN, high + LIMIT_MARGIN, robot.joints,
+        f"degrees, or joints in another order than {robot.joints[0]}, {robot.joints[1]}, ...?",
+    )  # fmt: skip
+    _check_range(
+        where, qpos[:, 2:3], np.array([-MAX_HEIGHT]), np.array([MAX_HEIGHT]), ("height",),
+        "another unit than m?",
+    )  # fmt: skip
+
+
+def _check_spacing(name: str, motion: judging.Motion, robot: Robot) -> None:
+    """Compare the way of the base between states with its velocity, which tells the rate."""
+    way = (motion.next_qpos - motion.qpos)[:, :3]
+    speed = 0.5 * (motion.qvel + motion.next_qvel)[:, :3]
+    power = float((speed**2).sum(axis=1).mean())
+    if power < LEAST_SPEED**2:
+        return
+    spacing, here = float((way * speed).sum(axis=1).mean()) / power, robot.control_dt
+    if not 1.0 / RATE_TOLERANCE < spacing / here < RATE_TOLERANCE:
+        raise DatasetError(
+            f"{name}: by the way of the base and its velocity, states are {spacing:.3g} s apart,"
+            f" and robot {robot.name} acts every {here:g} s (another rate, or velocities that are"
+            " not m/s in the world frame?)"
+        )
 
 
 def _check_observations(
-    path: Path, name: str, obs: np.ndarray, layout: tuple[Entry, ...], robot: Robot
+    name: str, data: Transition, layout: tuple[Entry, ...], robot: Robot
 ) -> None:
-    """Check entries of an observation whose range the robot or geometry decides."""
+    """Check entries of both observations whose range the robot or geometry decides."""
+    for field in ("obs", "next_obs"):
+        _check_entries(f"{name}: {field}", np.asarray(getattr(data, field)), layout, robot)
+    part = layout_slices(layout).get("previous_action[0]")
+    if part is None:
+        return
+    action, goes_on = np.asarray(data.action), ~np.asarray(data.terminated)
+    shown = np.asarray(data.next_obs)[:, part]
+    off = (np.abs(shown - action) > 1e-3).any(axis=1) & goes_on
+    if off.any():
+        row = int(np.argmax(off))
+        raise DatasetError(
+            f"{name}: next_obs, previous_action[0]: {shown[row, 0]:.3g} in row {row}, where the"
+            f" action is {action[row, 0]:.3g} (rows out of order, or next_obs of another step?)"
+        )
+
+
+def _check_entries(what: str, obs: np.ndarray, layout: tuple[Entry, ...], robot: Robot) -> None:
     low, high = robot.joint_limits.T
+    guess = "degrees, another order of the observation, or normalised observations?"
     for entry, part in layout_slices(layout).items():
         values, plain = obs[:, part], entry.partition("[")[0].removeprefix("target_")
-        where = f"{path}: {name}, {entry}"
+        where = f"{what}, {entry}"
         if plain == "joint_pos":
-            _check_range(where, values, low - LIMIT_MARGIN, high + LIMIT_MARGIN, robot.joints)
+            _check_range(
+                where, values, low - LIMIT_MARGIN, high + LIMIT_MARGIN, robot.joints, guess
+            )
         elif plain == "previous_action":
             one = np.ones(values.shape[1])
-            _check_range(where, values, -one, one, robot.joints)
+            _check_range(where, values, -one, one, robot.joints, guess)
         elif plain == "roll_pitch":
             most = np.array([math.pi, math.pi / 2]) + 0.01
-            _check_range(where, values, -most, most, ("roll", "pitch"))
+            _check_range(where, values, -most, most, ("roll", "pitch"), guess)
         elif plain in ("base_x_axis_w", "base_z_axis_w", "base_quat_h"):
             length = np.linalg.norm(values, axis=1)
             row = int(np.argmax(np.abs(length - 1.0)))
@@ -234,7 +383,12 @@ def _check_observations(
 
 
 def _check_range(
-    where: str, values: np.ndarray, low: np.ndarray, high: np.ndarray, names: tuple[str, ...]
+    where: str,
+    values: np.ndarray,
+    low: np.ndarray,
+    high: np.ndarray,
+    names: tuple[str, ...],
+    guess: str,
 ) -> None:
     beyond = np.maximum(low - values, values - high)
     row, column = np.unravel_index(int(np.argmax(beyond)), beyond.shape)
@@ -242,8 +396,7 @@ def _check_range(
         value = values[row, column]
         raise DatasetError(
             f"{where}: {names[column]} is {value:.3g} in row {row}, limits {low[column]:.3g} to"
-            f" {high[column]:.3g} (degrees, another order of the observation, or normalised"
-            " observations?)"
+            f" {high[column]:.3g} ({guess})"
         )
 
 

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from twirl_mjx import files, plugins, records
 from twirl_mjx.checks import check_choice
 from twirl_mjx.droq.learner import LEARNER
-from twirl_mjx.policies import foreign, onnx_file, recorded, scripted
+from twirl_mjx.policies import foreign, onnx_file, recorded, rows, scripted
 from twirl_mjx.policies.clip import ClipPolicy
 from twirl_mjx.policies.contract import Contract
 from twirl_mjx.policies.function import BrainPolicy, brain_of_function, from_policy
@@ -106,10 +106,10 @@ def resolve_policy(
     if name in SCRIPTED_SOURCES:
         _refuse_terms(terms, f"{name} is scripted")
         return _scripted(name, config)
-    path = Path(name)
-    if recorded.is_recording(path):
+    if rows.is_recording(name):
         _refuse_terms(terms, f"{name} is recorded data")
-        return _recording(path, config)
+        return _recording(name, config)
+    path = Path(name)
     if resolve_policy_path(path).suffix == ".onnx":
         given = find_contract(terms.contract, ROBOTS.get(config.robot)) if terms.contract else None
         loaded = onnx_file.load_onnx(resolve_policy_path(path), given.memory if given else ())
@@ -119,6 +119,28 @@ def resolve_policy(
         loaded = load_policy(path)
     _refuse_terms(terms, f"{name} says its own task and observation")
     return _learned(name, loaded, config, noise)
+
+
+def resolve_actor(name: str, config: WorldConfig, *, terms: Terms = PLAIN) -> Source:
+    """Return a source that acts; errors as :func:`resolve_policy`.
+
+    Raises:
+        ValueError: It is recorded data, which is not even read.
+    """
+    check_acts(name)
+    return resolve_policy(name, config, terms=terms)
+
+
+def check_acts(name: str) -> None:
+    """Refuse recorded data.
+
+    Raises:
+        ValueError: ``name`` is that of recorded data.
+    """
+    if rows.is_recording(name):
+        raise ValueError(
+            f"{name} is recorded data, which does not act (nearest: the policy behind it)"
+        )
 
 
 def _refuse_terms(terms: Terms, why: str) -> None:
@@ -200,14 +222,9 @@ def _function(reference: str, config: WorldConfig, terms: Terms) -> Source:
     return Source(policy, reference, digest, notes=foreign.describe(contract, robot))
 
 
-def _recording(path: Path, config: WorldConfig) -> Source:
-    layout, robot = config.make_task().observer.layout, ROBOTS.get(config.robot)
-    data, digest, shift = recorded.read(path, task=config.task, layout=layout, robot=robot)
-    notes = ("its rewards are taken as they were recorded",)
-    if shift and shift != config.shift:
-        notes += (f"it was recorded under shift {shift}, this is shift {config.shift}",)
-    policy = recorded.RecordedPolicy(str(path))
-    return Source(policy, str(path), digest, data=data, notes=notes)
+def _recording(name: str, config: WorldConfig) -> Source:
+    data, digest, notes = recorded.read(name, config)
+    return Source(recorded.RecordedPolicy(name), name, digest, data=data, notes=notes)
 
 
 def header_of(name: str) -> PolicyHeader | None:
@@ -218,7 +235,7 @@ def header_of(name: str) -> PolicyHeader | None:
         PolicyFileError: The file is no policy.
     """
     recorded.refuse_format(name)
-    if name in SCRIPTED_SOURCES or plugins.is_reference(name) or recorded.is_recording(Path(name)):
+    if name in SCRIPTED_SOURCES or plugins.is_reference(name) or rows.is_recording(name):
         return None
     path = resolve_policy_path(name)
     if path.suffix == ".onnx":
@@ -233,7 +250,7 @@ def takes_terms(name: str) -> bool:
         FileNotFoundError: Nothing to load there.
         PolicyFileError: The file is no policy.
     """
-    if name in SCRIPTED_SOURCES or recorded.is_recording(Path(name)):
+    if name in SCRIPTED_SOURCES or rows.is_recording(name):
         return False
     return header_of(name) is None
 

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Literal
 
 from twirl_mjx import files, plugins
+from twirl_mjx.policies import rows
 from twirl_mjx.sim.dynamics import SHIFTS
 from twirl_mjx.sim.robots import ROBOTS
 from twirl_mjx.sweep.grid import Draft, Grid, configure
@@ -142,6 +143,8 @@ def _source_of(
         case source_rules.InFile(reference):
             file, name = plugins.split(reference, "policy")
             return f"{_identity_of_path(file)} {name}", f"{file}:{name}", ()
+        case source_rules.AtPath(path) if str(path).startswith(rows.MINARI):
+            return f"{path} {files.checksum(rows.find_minari(str(path))[0])[:12]}", str(path), ()
         case source_rules.AtPath(path, is_shipped):
             return _identity_of_path(path), "auto" if is_shipped else str(path.resolve()), ()
         case source_rules.NominalRun() if path := given.get(config.task):

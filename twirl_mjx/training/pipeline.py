@@ -22,9 +22,9 @@ import jax.numpy as jnp
 
 from twirl_mjx import exits, files, records
 from twirl_mjx.checks import check_once, choose_one
-from twirl_mjx.policies import recorded
+from twirl_mjx.policies import recorded, rows
 from twirl_mjx.policies.foreign import MAX_CLIPPED
-from twirl_mjx.policies.resolve import SCRIPTED_SOURCES, Source, resolve_policy
+from twirl_mjx.policies.resolve import SCRIPTED_SOURCES, Source, check_acts, resolve_policy
 from twirl_mjx.replay import dataset, ring
 from twirl_mjx.training import loop, memory, rundir, source_rules
 from twirl_mjx.training.checkpoint import load_replay
@@ -220,6 +220,8 @@ def check_early(
         raise ValueError("variant scratch uses no source (nearest: variant 'twirl')")
     source_rules.check_source_is_used(config, preset)
     files.check_target(run_dir.config)
+    if config.variant not in ("scratch", "twirl") and source is None:
+        check_acts(config.source)  # networks, or a policy to evaluate, are asked for
     config.make_task()  # refuses options that only the task can judge
     config.evaluation.make_task()
     if config.variant != "scratch" and source is None:
@@ -239,7 +241,7 @@ def _outlived_its_source(config: TrainConfig, preset: str, runs_dir: Path, run_d
         case source_rules.Scripted():
             return False
         case source_rules.AtPath(path):
-            return not path.exists()
+            return not _is_there(path)
         case source_rules.InFile(reference):
             return not Path(reference.rpartition(":")[0]).expanduser().exists()
         case source_rules.RunOf(first):
@@ -327,7 +329,7 @@ def _find_sources(
                 shown = f"assets/policies/{path.name}"
                 say(f"source: the shipped policy {shown} (--source train trains your own)")
             recorded.refuse_format(str(path))
-            if not path.exists():
+            if not _is_there(path):
                 raise FileNotFoundError(no_such_source(path, runs_dir))
             return [at(path)] * len(members)
         case source_rules.RunOf():
@@ -344,6 +346,11 @@ def _find_sources(
                 say(f"stage 1 of 3: source policy, task {each.config.task}, in {each.run_dir}")
             _run_all(first, preset, runs_dir, say, None, deadline)
             return [at(each.run_dir.path) for each in first]
+
+
+def _is_there(path: Path) -> bool:
+    """Return whether a source may exist: what Minari keeps has a name and no path."""
+    return path.exists() or str(path).startswith(rows.MINARI)
 
 
 def no_such_source(path: Path, runs_dir: Path) -> str:

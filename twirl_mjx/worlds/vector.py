@@ -109,7 +109,7 @@ def state_bounds(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
     )
 
 
-def _in_full_precision[**P, T](function: Callable[P, T]) -> Callable[P, T]:
+def in_full_precision[**P, T](function: Callable[P, T]) -> Callable[P, T]:
     """Let a function multiply in float32, whatever jax's default is.
 
     GPUs and TPUs round the operands of float32 products to 10 or 7 bits unless they are told not
@@ -277,14 +277,14 @@ class VectorEnv:
     def _compiled_reset(self) -> Callable[..., EnvState]:
         return jax.jit(self._reset)
 
-    @_in_full_precision
+    @in_full_precision
     def _reset(
         self, key: jax.Array, dynamics: Dynamics | None, index: jax.Array | None
     ) -> EnvState:
         dynamics = self.dynamics if dynamics is None else broadcast(dynamics, self.num_envs)
         index = jnp.arange(self.num_envs) if index is None else index
         keys = jax.vmap(jax.random.fold_in, (None, 0))(key, index)
-        qpos, qvel, world, obs = jax.vmap(self._start_world)(keys, dynamics)
+        qpos, qvel, world, obs = jax.vmap(self.start_world)(keys, dynamics)
         data = make_data(self.scene, self.num_envs)
         data = data.replace(qpos=qpos, qvel=qvel, ctrl=qpos[:, 7:])
         flags = jnp.zeros(self.num_envs, bool)
@@ -328,15 +328,15 @@ class VectorEnv:
     def _compiled_step(self) -> Callable[[EnvState, jax.Array], tuple[EnvState, jax.Array]]:
         return jax.jit(self._step)
 
-    @_in_full_precision
+    @in_full_precision
     def _step(self, state: EnvState, action: jax.Array) -> tuple[EnvState, jax.Array]:
         finite_action = jnp.all(jnp.isfinite(action), axis=-1)
         good_view = jnp.all(jnp.abs(state.obs) <= OBSERVATION_LIMIT, axis=-1)
         action = jnp.clip(jnp.nan_to_num(action.astype(jnp.float32)), -1.0, 1.0)
-        world, command = jax.vmap(self._command)(state.world, state.data.ctrl, action)
+        world, command = jax.vmap(self.command)(state.world, state.data.ctrl, action)
         pushed = state.data.replace(qvel=jax.vmap(self._push)(world, state.data.qvel))
         data, trace = self.engine.step(pushed, command, world.dynamics)
-        world, next_obs, outcome, fault = jax.vmap(self._judge_world)(world, command, trace)
+        world, next_obs, outcome, fault = jax.vmap(self.judge_world)(world, command, trace)
         fault = jnp.where(finite_action, fault, BAD_ACTION)
         fault = jnp.where(good_view, fault, BAD_VIEW)
         invalid = fault > 0
@@ -360,9 +360,10 @@ class VectorEnv:
         physics, world, obs = jax.lax.cond(jnp.any(ended.done), restart, lambda x: x, live)
         return ended.replace(data=data.replace(**physics), world=world, obs=obs), fault
 
-    def _start_world(
+    def start_world(
         self, key: jax.Array, dynamics: Dynamics
     ) -> tuple[jax.Array, jax.Array, World, jax.Array]:
+        """Start an episode in one world: qpos, qvel, the rest of it, and what the policy sees."""
         key, start_key, motor_key = jax.random.split(key, 3)
         if self.ranges:
             dynamics = draw(jax.random.fold_in(key, DRAW), dynamics, self.ranges)
@@ -379,9 +380,9 @@ class VectorEnv:
             task=start.task,
         )
         obs = self.task.observer.observe(start.memory, start.goal, start.qpos, start.qvel)
-        return start.qpos, start.qvel, world, self._sense(world, obs)
+        return start.qpos, start.qvel, world, self.sense(world, obs)
 
-    def _command(
+    def command(
         self, world: World, previous: jax.Array, action: jax.Array
     ) -> tuple[World, actuation.MotorCommand]:
         """Turn an action into the motors' command; ``previous`` [J] is the last target in rad."""
@@ -407,16 +408,17 @@ class VectorEnv:
         impulse = world.dynamics.push * jnp.stack([jnp.cos(angle), jnp.sin(angle)])
         return qvel.at[:2].add(jnp.where(due, impulse, 0.0))
 
-    def _sense(self, world: World, obs: jax.Array) -> jax.Array:
+    def sense(self, world: World, obs: jax.Array) -> jax.Array:
         """Return the observation [O] with the sensors' noise of this instant."""
         if world.dynamics.obs_noise is None:
             return obs
         deviation = world.dynamics.obs_noise * layout_noise(self.task.observer.layout)
         return obs + deviation * jax.random.normal(_key_now(world, NOISE), obs.shape)
 
-    def _judge_world(
+    def judge_world(
         self, world: World, command: actuation.MotorCommand, trace: Trace
     ) -> tuple[World, jax.Array, Outcome, jax.Array]:
+        """Observe and judge a control step of one world; the last one is an index to ``FAULTS``."""
         view = make_view(self.scene, world.dynamics, trace.qpos, trace.qvel)
         torque = actuation.pd_torque(command, trace.qpos[:, 7:], trace.qvel[:, 6:])
         memory = self.task.observer.push(world.memory, view.qpos, view.qvel, world.action)
@@ -437,12 +439,12 @@ class VectorEnv:
         )
         first = jnp.argmin(jnp.stack(good)).astype(jnp.int32) + 1
         fault = jnp.where(functools.reduce(jnp.logical_and, good), 0, first)
-        return world, self._sense(world, obs), outcome, fault
+        return world, self.sense(world, obs), outcome, fault
 
     def _restart(self, done: jax.Array, live: Live) -> Live:
         """Start new episodes in the worlds whose episode ended; leave the others untouched."""
         physics, world, _ = live
-        qpos, qvel, fresh_world, fresh_obs = jax.vmap(self._start_world)(world.key, world.dynamics)
+        qpos, qvel, fresh_world, fresh_obs = jax.vmap(self.start_world)(world.key, world.dynamics)
         fresh = {name: jnp.zeros_like(leaf) for name, leaf in physics.items()}
         fresh |= {"qpos": qpos, "qvel": qvel, "ctrl": qpos[:, 7:]}
         return _select(done, (fresh, fresh_world, fresh_obs), live)

@@ -2,28 +2,12 @@
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Mapping
-from types import ModuleType
 
+from twirl_mjx.plugins import required
 from twirl_mjx.training.sinks.base import RunInfo
 
 PROJECT = "twirl_mjx"
-
-
-def required(package: str) -> ModuleType:
-    """Import an optional package.
-
-    Raises:
-        ValueError: It is not installed; the message says what to install.
-    """
-    try:
-        return importlib.import_module(package)
-    except ImportError as error:
-        raise ValueError(
-            f"--log {package} needs a package that is not installed: pip install"
-            f" 'twirl-mjx[{package}]' ({error})"
-        ) from error
 
 
 class Wandb:
@@ -34,7 +18,7 @@ class Wandb:
     """
 
     def __init__(self) -> None:
-        self._wandb = required("wandb")
+        self._wandb = required("wandb", "--log wandb")
 
     def open(self, run: RunInfo) -> None:
         """Start a run."""
@@ -63,7 +47,7 @@ class Trackio:
     """Trackio, which keeps its tables on this machine; starts and groups are those of `Wandb`."""
 
     def __init__(self) -> None:
-        self._trackio = required("trackio")
+        self._trackio = required("trackio", "--log trackio")
 
     def open(self, run: RunInfo) -> None:
         """Start a run."""
