@@ -1,7 +1,8 @@
-"""What differs between operating systems: cores and locks. Linux and macOS have both."""
+"""What differs between machines: cores, locks, accelerators. Linux and macOS have the first two."""
 
 from __future__ import annotations
 
+import importlib.util
 import os
 import sys
 from typing import TextIO
@@ -24,6 +25,18 @@ def usable_cores() -> list[int]:
     if hasattr(os, "sched_getaffinity"):
         return sorted(os.sched_getaffinity(0))
     return list(range(os.cpu_count() or 1))
+
+
+def may_have_accelerator() -> bool:
+    """Return whether anything is installed that could give jax another device than the CPU.
+
+    Asked without jax, which takes seconds to import: its plug-ins are modules or entry points.
+    """
+    if any(importlib.util.find_spec(name) for name in ("jax_plugins", "libtpu")):
+        return True
+    from importlib.metadata import entry_points  # takes a while to import
+
+    return bool(entry_points(group="jax_plugins"))
 
 
 def try_lock(file: TextIO, *, shared: bool = False) -> bool:
