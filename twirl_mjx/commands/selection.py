@@ -37,4 +37,5 @@ def the_one(word: str, runs: Path = RUNS) -> str:
     if len(found) > 1:
         names = ", ".join(Path(path).name for path in found)
         raise ValueError(f"{word!r} selects {len(found)} runs, expected one: {names}")
-    return found[0]
+    (only,) = found
+    return only

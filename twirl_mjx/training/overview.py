@@ -73,7 +73,9 @@ def known(folder: Path) -> list[Path]:
 def condition(word: str) -> tuple[str, str] | None:
     """Return setting and value of a word such as ``task:biped``, None where it is no such word."""
     match = re.fullmatch(r"([a-z][a-z0-9_.]*):([^/]+)", word)
-    return None if match is None or is_reference(word) or Path(word).exists() else match.groups()
+    if match is None or is_reference(word) or Path(word).exists():
+        return None
+    return match[1], match[2]
 
 
 def find(folder: Path, words: Sequence[str] = ()) -> list[Path]:
