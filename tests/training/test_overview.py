@@ -96,7 +96,7 @@ def test_conditions_narrow_and_hold_together(tmp_path: Path) -> None:
     assert overview.find(tmp_path, ("biped-*", "droq.utd:1.0")) == [b]
     assert overview.find(tmp_path, ("name:*-b", "status:finished")) == []
     assert overview.find(tmp_path / "none", ("task:biped",)) == []
-    with pytest.raises(ValueError, match="condition on runs.*tsk.*nearest: 'task'"):
+    with pytest.raises(ValueError, match=r"condition on runs.*tsk.*nearest: 'task'"):
         overview.find(tmp_path, ("tsk:biped",))
 
 
@@ -109,7 +109,7 @@ def test_policies_keep_their_place_and_runs_become_paths(tmp_path: Path) -> None
     assert overview.expand(["biped-b", a], tmp_path) == [b, a]
     assert overview.expand(["seed:0", "zero"], tmp_path) == [a, b, "zero"]
     assert overview.expand(["biped-a"], tmp_path, but=("biped-a",)) == ["biped-a"]
-    with pytest.raises(FileNotFoundError, match="no run in .* fits seed:1"):
+    with pytest.raises(FileNotFoundError, match=r"no run in .* fits seed:1"):
         overview.expand(["zero", "seed:1"], tmp_path)
 
 
