@@ -126,7 +126,8 @@ def test_runs_by_themselves_are_reported(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     _, cells = plan_of
-    paths = [finish_run(cell, tmp_path / "runs") for cell in cells]
+    two = [cell for cell in cells if cell.config.task == "biped"][:2]
+    paths = [finish_run(cell, tmp_path / "runs") for cell in two]
     folder = gather_runs(paths, tmp_path / "results")
     arms = {re.sub(r"-s\d+$", "", path.name) for path in paths}
     assert {p.name for p in folder.glob("*.csv")} == {
@@ -138,7 +139,7 @@ def test_runs_by_themselves_are_reported(
     words = ["report", "task:biped", "--runs", str(tmp_path / "runs"), "--out", str(page)]
     assert cli.main(words) == 0
     text = page.read_text(encoding="utf-8")
-    assert all(arm in text for arm in arms) and f"{len(paths)} runs" in text
+    assert all(arm in text for arm in arms) and "2 runs" in text
     (paths[0] / "eval.csv").unlink()
     assert cli.main([*words, "--overwrite"]) == 2
     assert f"{paths[0]} is not finished" in capsys.readouterr().err
