@@ -33,9 +33,8 @@ def the_one(word: str, runs: Path = RUNS) -> str:
         FileNotFoundError: A condition, and no run that fits.
         ValueError: Several runs fit, or a condition on what no run has.
     """
-    found = selected([word], runs)
+    found = list(selected([word], runs))
     if len(found) > 1:
         names = ", ".join(Path(path).name for path in found)
         raise ValueError(f"{word!r} selects {len(found)} runs, expected one: {names}")
-    (only,) = found
-    return only
+    return found[0]
