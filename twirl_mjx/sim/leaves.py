@@ -189,7 +189,7 @@ register_shift = SHIFTS.register
 get_shift = SHIFTS.get
 shift_names = SHIFTS.names
 
-for _shift in (
+_PAPER = (
     Shift("none", about="training conditions"),
     Shift("bumpy", scene="bumpy", about="random heightfield, at most 0.05 m", bump_height=0.05),
     Shift("icy", about="friction 0.4", friction=0.4),
@@ -201,10 +201,11 @@ for _shift in (
     ),
     Shift("sloped", scene="sloped", about="8 degree hill 0.5 m ahead", incline=HILL_ANGLE),
     Shift("gravity", about="gravity 3.7 m/s^2", gravity=3.7),
-):
-    register_shift(_shift)  # paper, section "Transfer to New Environments"
+)  # paper, section "Transfer to New Environments"
+for _shift in _PAPER:
+    register_shift(_shift)
 
-PAPER_SHIFTS = shift_names()
+PAPER_SHIFTS = tuple(_shift.name for _shift in _PAPER)
 """Nominal conditions and the five shifts of the paper, which evaluation goes through."""
 
 
