@@ -226,7 +226,8 @@ BRIEF = {
     r"make test$": 'make test ARGS="-n 0 -q tests/test_links.py"',
     r"make lint$": ".venv/bin/ruff check -q .",
     r"make figures$": 'make figures ARGS="--no-pictures"',
-    r"make report$": 'make report ARGS="--results experiments/results/phi_reduced"',
+    r"make report$": "mkdir -p build/one && cp -r experiments/results/trot build/one/ &&"
+    ' make report ARGS="--results build/one"',
     r"(make sweep .*--reduced)\"$": r'\1 --dry-run"',
     r"(.*twirl train .*--seeds) 0 1 2 3(.*)": rf"\1 0 1\2 {SHORT}",
     r"(.*twirl train .*trot48.*)": rf"\1 {SHORT}",
