@@ -20,7 +20,7 @@ CASE = $(call option,task,TASK) $(call option,shift,SHIFT) $(call option,seed,SE
 .PHONY: help setup bench-setup gpu-setup lint format test test-slow test-gpu test-jax-oldest \
 	test-faults fuzz audit \
 	gpu-counts gpu-proof train evaluate collect sweep figures report render view demo bench \
-	curriculum docs dist clean
+	curriculum web docs dist clean
 
 help: ## show this table
 	@echo 'usage: make TARGET [TASK=..] [SHIFT=..] [SEED=..] [RUN=..] [GRID=..] [ARGS=".."]'
@@ -101,6 +101,11 @@ view: setup ## watch RUN= (or the shipped biped) in a browser (ARGS="--html repl
 
 demo: setup ## render and evaluate the shipped policies; trains nothing
 	$(TWIRL) demo $(ARGS)
+
+web: setup ## build a page that simulates in the browser into build/web (needs npm)
+	npm install --prefix build/npm --no-save --no-package-lock --silent @mujoco/mujoco@3.14.0
+	.venv/bin/python -m twirl_mjx.view.web build/npm/node_modules/@mujoco/mujoco build/web
+	@echo 'serve it: .venv/bin/python -m http.server -d build/web, then http://localhost:8000/'
 
 bench: bench-setup ## measure this machine, beside SBX
 	$(TWIRL) bench $(ARGS)

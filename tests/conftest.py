@@ -215,6 +215,19 @@ class Browser:
         png = base64.b64decode(self.send("Page.captureScreenshot")["data"])
         return np.asarray(Image.open(io.BytesIO(png)).convert("RGB"), float)
 
+    def dark_share(self):
+        """Share of dark pixels, which only the robot has, in the middle of the picture."""
+        picture = self.picture()
+        height, width = picture.shape[:2]
+        middle = picture[height // 4 : 3 * height // 4, width // 4 : 3 * width // 4]
+        return float((middle.max(axis=-1) < 90).mean())
+
+    def wait_until(self, script, seconds=30.0):
+        deadline = time.monotonic() + seconds
+        while not self.run(script):
+            assert time.monotonic() < deadline, script
+            time.sleep(0.1)
+
     def errors(self):
         return self.of("Runtime.exceptionThrown", "Runtime.consoleAPICalled", "Log.entryAdded")
 

@@ -9,7 +9,7 @@ import pytest
 
 from twirl_mjx import cli
 from twirl_mjx.commands.curriculum import CurriculumOptions, chain_of, plan
-from twirl_mjx.sim.dynamics import PAPER_SHIFTS
+from twirl_mjx.sim.leaves import PAPER_SHIFTS
 from twirl_mjx.training import rundir
 from twirl_mjx.training.presets import make_config
 

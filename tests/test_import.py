@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from twirl_mjx import assets
+from twirl_mjx import assets, cli
 
 # An audit hook sees every file that is opened. jax is allowed to be imported, not to start a
 # device: `backends_are_initialized` is what jax itself asks before it may change platforms.
@@ -80,3 +80,45 @@ def test_asset_path_names_both_places() -> None:
 def test_asset_path_stays_inside(bad: str) -> None:
     with pytest.raises(ValueError, match="below the assets folder"):
         assets.asset_path(bad)
+
+
+_HEAVY = """
+import contextlib, io, sys
+from twirl_mjx import cli
+heavy = ("jax", "mujoco", "flax", "optax", "orbax", "scipy", "matplotlib", "onnx", "ray")
+for line in {lines!r}:
+    before = set(sys.modules)
+    with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
+        with contextlib.suppress(SystemExit):
+            cli.main(line.split())
+    print(line, [name for name in heavy if name in sys.modules and name not in before])
+"""
+
+
+def heavy_imports(lines: list[str]) -> list[str]:
+    """Return, for each command line, which heavy packages it was the first to import."""
+    result = subprocess.run(
+        [sys.executable, "-c", _HEAVY.format(lines=lines)],
+        env={**os.environ, "PYTHONPATH": str(Path(assets.__file__).parents[1])},
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=True,
+    )
+    return result.stdout.splitlines()
+
+
+def test_help_and_refusals_of_every_command_import_nothing_heavy(tmp_path: Path) -> None:
+    """A first word and a typo are answered at once: what simulates is loaded after the options."""
+    nested = ("runs list", "runs prune", "clip make", "clip show", "clip check")
+    lines = [f"{name} --help" for name in (*cli.COMMANDS, *nested)]
+    lines += [f"{name} --taks biped" for name in cli.COMMANDS]
+    lines += ["train --task bipd", "train --num-envs 0", "evaluate zero --shifts icey", "hlep",
+              f"runs --runs {tmp_path}", f"runs --runs {tmp_path} --status finished"]  # fmt: skip
+    assert heavy_imports(lines) == [f"{line} []" for line in lines]
+
+
+def test_heavy_imports_are_noticed() -> None:
+    first, second = heavy_imports(["clip check", "train --help"])
+    assert "'jax'" in first
+    assert second == "train --help []"

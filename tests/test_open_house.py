@@ -20,7 +20,7 @@ import pytest
 import twirl_mjx
 from twirl_mjx import cli, plugins
 from twirl_mjx.commands.options import parse_train
-from twirl_mjx.sim.dynamics import SHIFTS
+from twirl_mjx.sim.leaves import SHIFTS
 from twirl_mjx.sweep import plan
 from twirl_mjx.sweep.grid import load
 from twirl_mjx.tasks.registry import TASKS

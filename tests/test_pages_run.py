@@ -153,12 +153,16 @@ RUN = (("README.md", 0), ("adapters.md", 0), ("shifts.md", 1), ("view.md", 0))
 one's own."""
 
 
+PATIENCE_S = 1500
+"""s, longest that a shortened example may take on a machine that does other things as well."""
+
+
 def run_python(text: str, folder: Path) -> None:
     for long, short in SHORTER.items():
         text = text.replace(long, short)
     done = subprocess.run(
         [sys.executable, "-c", GIVEN + text],
-        cwd=folder, env=os.environ | {"PYTHONPATH": str(ROOT)}, timeout=280,
+        cwd=folder, env=os.environ | {"PYTHONPATH": str(ROOT)}, timeout=PATIENCE_S - 20,
         capture_output=True, text=True, check=False,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
@@ -166,6 +170,7 @@ def run_python(text: str, folder: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(PATIENCE_S)
 @pytest.mark.parametrize(("name", "place"), RUN)
 def test_python_of_the_pages_runs(name: str, place: int, tmp_path: Path) -> None:
     page = next(page for page in PAGES if page.name == name)
@@ -192,8 +197,9 @@ def test_the_notebook_was_executed_and_is_small() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(PATIENCE_S)
 def test_the_notebook_runs(tmp_path: Path) -> None:
-    """Its code as it stands, but for a training of seconds; the film goes nowhere."""
+    """Its code as it stands, but for a training and a film of seconds; the film goes nowhere."""
     text = "\n".join("".join(cell["source"]) for cell in cells())
     shown = (
         "import sys, types\n"
@@ -203,6 +209,96 @@ def test_the_notebook_runs(tmp_path: Path) -> None:
     settings = re.compile(r'    preset="cpu",.*?    say=', re.S)
     short = settings.sub('    preset="debug",\n    say=', text)
     assert "total_env_steps" in text and "total_env_steps" not in short
-    run_python(f"{shown}\n{short.replace('plt.show()', '')}", tmp_path)
+    for long, brief in (("plt.show()", ""), ("steps=80", "steps=8"), ("episodes=2", "episodes=1")):
+        assert long in short
+        short = short.replace(long, brief)
+    run_python(f"{shown}\n{short}", tmp_path)
     for name in ("first-steps-film.mp4", "first-steps.html", "first-steps/policy.npz"):
         assert (tmp_path / "runs" / name).is_file()
+
+
+# ---- the command blocks, in order, on a clean clone
+
+SHORT = "--preset debug"
+BRIEF = {
+    r"make demo$": 'make demo ARGS="--episodes 1 --no-film"',
+    r"make train TASK=biped$": f'make train TASK=biped ARGS="{SHORT} --name biped-twirl-cpu-s0"',
+    r"make test$": 'make test ARGS="-n 0 -q tests/test_links.py"',
+    r"make lint$": ".venv/bin/ruff check -q .",
+    r"make figures$": 'make figures ARGS="--no-pictures"',
+    r"make report$": "mkdir -p build/one && cp -r experiments/results/trot build/one/ &&"
+    ' make report ARGS="--results build/one"',
+    r"(make sweep .*--reduced)\"$": r'\1 --dry-run"',
+    r"(.*twirl train .*--seeds) 0 1 2 3(.*)": rf"\1 0 1\2 {SHORT}",
+    r"(.*twirl train .*trot48.*)": rf"\1 {SHORT}",
+    r"(.*twirl render .*)": r"\1 --seconds 1 --panels 2",
+    r"(.*twirl rehearse .*)": r"\1 --episodes 1 --robot.episode-s 2",
+    r"(.*twirl evaluate .*)": r"\1 --episodes 1 --shifts none",
+    r"(.*twirl view(?: runs\S*)?)$": r"\1 --seconds 1 --html live.html --overwrite",
+    r"(.*twirl view .*--html .*)": r"\1 --seconds 1",
+}
+"""Command line -> its shortened form; what is not here runs as it stands."""
+LEFT_OUT = {
+    r"make setup|make format|\.ci/run": "an environment, and what CI does",
+    r"docker ": "no container engine",
+    r"make web": "tests/view/test_web.py does it",
+    r".*http\.server": "serves until it is stopped",
+    r".*downloaded\.onnx": "a file of the reader's",
+    r"T=|.*train \$T": "hours of runs that made a shipped policy",
+    r"make gpu|make test-gpu": "needs a GPU, or gigabytes",
+}
+"""Lines that are not run -> why."""
+BLOCKS = [page for page in PAGES if any(blocks(page, "sh", "bash", "console"))]
+
+
+@pytest.fixture(scope="module")
+def clone(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What is committed, in a folder with a blank, with the environment of this checkout."""
+    folder = tmp_path_factory.mktemp("pages") / "a clone"
+    subprocess.run(["git", "clone", "-q", str(ROOT), str(folder)], check=True)
+    (folder / ".ci" / "setup").write_text("#!/bin/sh\n")
+    (folder / ".venv" / "bin").mkdir(parents=True)
+    for name in ("twirl", "pytest", "ruff", "python"):
+        module = {"twirl": "-m twirl_mjx ", "python": ""}.get(name, f"-m {name} ")
+        script = folder / ".venv" / "bin" / name
+        script.write_text(f'#!/bin/sh\nexec {shlex.quote(sys.executable)} {module}"$@"\n')
+        script.chmod(0o755)
+    return folder
+
+
+def shell_lines(page: Path) -> Iterator[str]:
+    for block in blocks(page, "sh", "bash", "console"):
+        for line in block.replace("\\\n", " ").splitlines():
+            if text := re.sub(r"(^|\s)#.*", "", line).strip():
+                yield text
+
+
+def brief(line: str) -> str:
+    """Return what is run for a line; empty where nothing is."""
+    if any(re.match(pattern, line) for pattern in LEFT_OUT):
+        return ""
+    for pattern, short in BRIEF.items():
+        if re.fullmatch(pattern, line):
+            return re.sub(pattern, short, line)
+    return line
+
+
+def test_every_shortened_and_every_omitted_line_is_on_a_page() -> None:
+    lines = [line for page in BLOCKS for line in shell_lines(page)]
+    for pattern in (*LEFT_OUT, *BRIEF):
+        if not pattern.startswith("make gpu"):
+            assert any(re.match(pattern, line) for line in lines), pattern
+    assert not [line for line in lines if "make train" in line and "debug" not in brief(line)]
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(2 * PATIENCE_S)
+@pytest.mark.parametrize("page", BLOCKS, ids=lambda page: page.relative_to(ROOT).as_posix())
+def test_command_blocks_run_in_order(page: Path, clone: Path) -> None:
+    environ = os.environ | {"PYTHONPATH": str(clone), "MPLBACKEND": "Agg"}
+    environ["PATH"] = f"{clone / '.venv' / 'bin'}{os.pathsep}{environ['PATH']}"
+    for line in filter(None, map(brief, shell_lines(page))):
+        done = subprocess.run(["sh", "-c", line], cwd=clone, env=environ, timeout=PATIENCE_S,
+                              capture_output=True, text=True, check=False)  # fmt: skip
+        assert done.returncode == 0, f"{line}\n{done.stdout[-2000:]}{done.stderr[-2000:]}"
+        assert "Traceback" not in done.stderr, f"{line}\n{done.stderr[-2000:]}"

@@ -45,7 +45,7 @@ def test_what_cannot_be_loaded_is_one_line(reference: str, message: str, tmp_pat
 
 
 def test_the_same_file_in_another_place_is_the_same_thing(tmp_path: Path) -> None:
-    registry = plugins.Registry("shift", home=(), accept=lambda item: item, group="none")
+    registry = plugins.Registry("shift", accept=lambda item: item, group="none")
     text = "class Mud:\n    name = 'mud'\n"
     for folder in ("here", "there", "other"):
         (tmp_path / folder).mkdir()

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from twirl_mjx.policies.learned import load_policy as load_policy
-    from twirl_mjx.sim.dynamics import Shift as Shift
+    from twirl_mjx.sim.leaves import Shift as Shift
     from twirl_mjx.sim.robot import Robot as Robot
     from twirl_mjx.tasks.base import Outcome as Outcome
     from twirl_mjx.tasks.base import Start as Start
@@ -32,7 +32,7 @@ _HOMES = {
     "Outcome": "twirl_mjx.tasks.base",
     "Robot": "twirl_mjx.sim.robot",
     "RunResult": "twirl_mjx.training.api",
-    "Shift": "twirl_mjx.sim.dynamics",
+    "Shift": "twirl_mjx.sim.leaves",
     "Start": "twirl_mjx.tasks.base",
     "Task": "twirl_mjx.tasks.task",
     "WorldConfig": "twirl_mjx.worlds.config",

@@ -1,8 +1,9 @@
-"""What differs between operating systems: cores, locks and a place for them."""
+"""What differs between machines: cores, locks and a place for them, accelerators."""
 
 from __future__ import annotations
 
 import errno
+import importlib.util
 import os
 import stat
 import sys
@@ -62,6 +63,18 @@ def _is_own(folder: Path) -> bool:
         and not status.st_mode & others
         and os.access(folder, os.W_OK | os.X_OK)
     )
+
+
+def may_have_accelerator() -> bool:
+    """Return whether anything is installed that could give jax another device than the CPU.
+
+    Asked without jax, which takes seconds to import: its plug-ins are modules or entry points.
+    """
+    if any(importlib.util.find_spec(name) for name in ("jax_plugins", "libtpu")):
+        return True
+    from importlib.metadata import entry_points  # takes a while to import
+
+    return bool(entry_points(group="jax_plugins"))
 
 
 def try_lock(file: TextIO, *, shared: bool = False) -> bool:

@@ -12,9 +12,9 @@ import importlib
 import importlib.metadata
 import importlib.util
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from types import ModuleType
+from types import MappingProxyType, ModuleType
 from typing import Any
 
 from twirl_mjx import files
@@ -112,24 +112,29 @@ class Registry[T]:
     """Things of one kind by name."""
 
     def __init__(
-        self, kind: str, *, home: tuple[str, ...], accept: Callable[[Any], T], group: str
+        self,
+        kind: str,
+        *,
+        accept: Callable[[Any], T],
+        group: str,
+        shipped: Mapping[str, str] = MappingProxyType({}),
     ) -> None:
         """Make an empty registry.
 
         Args:
             kind: What messages call one of them, ``task`` say.
-            home: Modules whose import registers the built-in ones, in order.
             accept: Returns the thing to keep for what was given; raises ValueError, saying what
                 was expected, where it does not fit.
             group: Entry point group in which packages offer more.
+            shipped: Name -> ``module:object`` of built-in ones that are loaded when they are asked
+                for; others are registered where they are defined.
         """
         self.kind = kind
-        self._home = home
         self._accept = accept
         self._group = group
+        self._shipped = dict(shipped)
         self._items: dict[str, T] = {}
         self._references: dict[str, str] = {}
-        self._is_home_loaded = not home
         self._points: dict[str, importlib.metadata.EntryPoint] | None = None
 
     def register(self, item: Any) -> Any:
@@ -148,7 +153,7 @@ class Registry[T]:
         except ValueError as error:
             raise ValueError(f"{where}{error}") from None
         name: str = accepted.name  # type: ignore[attr-defined]
-        known = self._items.get(name)
+        known = self._find(name)
         home = self._references.get(name, "registered before")
         if reference and known is not None and _is_copy(reference, home):
             return name
@@ -170,9 +175,9 @@ class Registry[T]:
         """
         if is_reference(text):
             path, name = split(text, self.kind)
-            self._load_home()
             return self._add(load(text, self.kind), f"{path}:{name}")
-        self.get(text)
+        if text not in self._shipped:
+            self.get(text)
         return text
 
     def admit_if_fits(self, reference: str) -> str | None:
@@ -194,8 +199,7 @@ class Registry[T]:
         Raises:
             ValueError: Unknown name, with the nearest.
         """
-        self._load_home()
-        if name not in self._items and (point := self._entry_points().get(name)) is not None:
+        if self._find(name) is None and (point := self._entry_points().get(name)) is not None:
             self._add(point.load(), point.value)
             self._references.pop(name, None)  # it is found by its name, in every process
         if name not in self._items:
@@ -204,26 +208,22 @@ class Registry[T]:
 
     def names(self) -> tuple[str, ...]:
         """Return all names: the built-in ones, then what was registered or is installed."""
-        self._load_home()
-        own = {name: self._home.index(_module_of(item)) for name, item in self._items.items()
-               if _module_of(item) in self._home}  # fmt: skip
-        return tuple(dict.fromkeys([*sorted(own, key=own.__getitem__), *self._items,
-                                    *self._entry_points()]))  # fmt: skip
+        return tuple(dict.fromkeys([*self._shipped, *self._items, *self._entry_points()]))
 
     def builtin_names(self) -> tuple[str, ...]:
-        """Return the names of those that this package brings."""
-        self._load_home()
-        return tuple(n for n, item in self._items.items() if _module_of(item) in self._home)
+        """Return the names of those that are loaded when they are asked for."""
+        return tuple(self._shipped)
 
     def reference(self, name: str) -> str | None:
         """Return ``file.py:Name`` of a thing that came from a file, else None."""
         return self._references.get(name)
 
-    def _load_home(self) -> None:
-        if not self._is_home_loaded:
-            self._is_home_loaded = True
-            for module in self._home:
-                importlib.import_module(module)
+    def _find(self, name: str) -> T | None:
+        """Return what is registered or shipped under a name, None where there is neither."""
+        if name not in self._items and name in self._shipped:
+            module, _, attribute = self._shipped[name].partition(":")
+            self._items[name] = getattr(importlib.import_module(module), attribute)
+        return self._items.get(name)
 
     def _entry_points(self) -> dict[str, importlib.metadata.EntryPoint]:
         if self._points is None:  # looking through all installed packages takes 0.05 s
@@ -238,7 +238,3 @@ def _is_copy(reference: str, other: str) -> bool:
         return False
     (path, name), (other_path, other_name) = split(reference), split(other)
     return name == other_name and files.checksum(path) == files.checksum(other_path)
-
-
-def _module_of(item: Any) -> str:
-    return getattr(item, "__module__", "")

@@ -1,6 +1,6 @@
 "use strict";
 // The page around the picture: a replay of recorded frames (REPLAY holds them) or, with REPLAY
-// null, a live view of the loop that `twirl view` runs.
+// null, a live view of the loop that `twirl view` runs; with "inside", of one in the page (web.js).
 
 const at = id => document.getElementById(id);
 const PLOT_SECONDS = 10, FOLLOW_MS = 150;  // FOLLOW_MS: how far the camera lags behind
@@ -161,21 +161,35 @@ function replay(record, view) {
 
 // ---- live
 
-function live(view) {
-  const readouts = new Readouts();
-  let shown = null, frame = null, last = null, arrived = 0, controls = null, wanted = null;
-
-  const send = async (name, value = null) => {
+// The server's loop.
+const BEHIND = {
+  async act(name, value) {
     const answer = await fetch("do", {
       method: "POST", headers: { "Content-Type": "application/json" },
       body: JSON.stringify({ name, value }),
     });
-    if (!answer.ok) at("hint").textContent = await answer.text();
+    return answer.ok ? "" : answer.text();
+  },
+  async scene(number) { return (await fetch(`scene?${number}`)).json(); },
+  listen(take) {
+    const source = new EventSource("events");
+    source.onmessage = event => take(JSON.parse(event.data));
+    source.onerror = () => { at("status").textContent = "twirl view has ended"; };
+  },
+};
+
+function live(view, loop) {
+  const readouts = new Readouts();
+  let shown = null, frame = null, last = null, arrived = 0, controls = null, wanted = null;
+
+  const send = async (name, value = null) => {
+    const refusal = await loop.act(name, value);
+    if (refusal) at("hint").textContent = refusal;
   };
 
   const loadScene = async number => {
     wanted = number;
-    const scene = await (await fetch(`scene?${number}`)).json();
+    const scene = await loop.scene(number);
     if (wanted !== number) return;
     view.load(scene);
     shown = number;
@@ -196,21 +210,18 @@ function live(view) {
     if (controls) controls.follow(next);
   };
 
-  const connect = () => {
-    const source = new EventSource("events");
-    source.onmessage = event => take(JSON.parse(event.data));
-    source.onerror = () => { at("status").textContent = "twirl view has ended"; };
-  };
-
   const pause = () => send("pause", !(frame && frame.paused));
   at("time").remove();
   at("pause").addEventListener("click", pause);
   at("restart").addEventListener("click", () => send("restart"));
   at("speed").addEventListener("change", () => send("speed", Number(at("speed").value)));
-  at("hint").textContent = "pull the robot, drag the goal; elsewhere dragging turns, wheel zooms";
+  at("hint").textContent = "pull the robot, drag the goal or click; elsewhere dragging turns, wheel zooms";
   onKeys({ " ": pause, r: () => send("restart") });
-  view.listen((x, y) => grab(view, () => frame, send, x, y));
-  connect();
+  view.listen((x, y) => grab(view, () => frame, send, x, y), (x, y) => {
+    const point = frame && frame.goalMoves && view.pointAtLevel(x, y, frame.goal[2]);
+    if (point) send("goal", point.slice(0, 2));
+  });
+  loop.listen(take);
   startDrawing(view, now => {
     if (!frame || frame.scene !== shown) return null;
     const share = last ? Math.min((now - arrived) / 1000 * frame.speed / frame.dt, 1) : 1;
@@ -288,6 +299,7 @@ function buildControls(sliders, send) {
   const fill = (select, names) => {
     if (names.join("\n") === [...select.options].map(o => o.value).join("\n")) return;
     select.replaceChildren(...names.map(name => new Option(name)));
+    select.parentElement.hidden = names.length < 2;
   };
   return {
     choices: (policies, shifts) => { fill(policy, policies); fill(shift, shifts); },
@@ -305,12 +317,16 @@ function buildControls(sliders, send) {
   };
 }
 
+function sayWhy(error) { at("status").textContent = error.message; }
+
 let view = null;
 try {
   view = new SceneView(at("scene"));
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => view.setSky());
-  if (REPLAY) replay(REPLAY, view);
-  else live(view);
+  if (REPLAY === "inside")
+    Inside.begin().then(loop => live(view, loop)).catch(sayWhy);
+  else if (REPLAY) replay(REPLAY, view);
+  else live(view, BEHIND);
 } catch (error) {
-  at("status").textContent = error.message;
+  sayWhy(error);
 }

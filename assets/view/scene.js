@@ -5,6 +5,7 @@
 const SHADOW_PIXELS = 1024, SHADOW_HALF_SIZE = 1.6;
 const SUN = normalize([-0.35, -0.45, 1]);
 const GROUND_HALF_SIZE = 60;
+const CLICK_PIXELS = 5;
 
 // ---- vectors and matrices (column-major, as WebGL takes them)
 
@@ -423,20 +424,24 @@ class SceneView {
   }
 
   // Drag turns, wheel and two fingers zoom. `grab(x, y)` may claim a drag: it returns a function
-  // that is called with every position and with null at the end.
-  listen(grab = () => null) {
+  // that is called with every position and with null at the end. `click(x, y)` gets a press that
+  // stayed where it was.
+  listen(grab = () => null, click = () => null) {
     const canvas = this.canvas, fingers = new Map();
-    let held = null;
+    let held = null, still = null;
     canvas.addEventListener("pointerdown", event => {
       canvas.setPointerCapture(event.pointerId);
       fingers.set(event.pointerId, [event.clientX, event.clientY]);
       held = fingers.size === 1 ? grab(event.clientX, event.clientY) : null;
+      still = fingers.size === 1 && !held ? [event.clientX, event.clientY] : null;
     });
     canvas.addEventListener("pointermove", event => {
       const before = fingers.get(event.pointerId), now = [event.clientX, event.clientY];
       if (!before) return;
       fingers.set(event.pointerId, now);
       if (held) return held(...now);
+      if (still && Math.hypot(now[0] - still[0], now[1] - still[1]) < CLICK_PIXELS) return;
+      still = null;
       const [dx, dy] = [now[0] - before[0], now[1] - before[1]], camera = this.camera;
       if (fingers.size === 2) return this.zoom(Math.exp(-0.004 * dy));
       camera.azimuth -= 0.006 * dx;
@@ -446,7 +451,8 @@ class SceneView {
       canvas.addEventListener(name, event => {
         fingers.delete(event.pointerId);
         if (held) held(null);
-        held = null;
+        else if (still && name === "pointerup") click(...still);
+        held = still = null;
       });
     canvas.addEventListener("wheel", event => {
       event.preventDefault();

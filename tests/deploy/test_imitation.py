@@ -23,7 +23,8 @@ from twirl_mjx.sim.dynamics import make_dynamics
 from twirl_mjx.sim.robots import A1
 from twirl_mjx.sim.scene import build_scene
 from twirl_mjx.tasks import base
-from twirl_mjx.tasks.imitate import Imitate, ImitateOptions, ImitateState
+from twirl_mjx.tasks.cards import ImitateOptions
+from twirl_mjx.tasks.imitate import Imitate, ImitateState, clip_of
 
 STEPS = 30
 """Control steps of a test; a cycle of the leap has 25."""
@@ -41,7 +42,7 @@ def states(task: Imitate) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """Return qpos, qvel and action of a robot that follows the leap badly and drifts left."""
     rng = np.random.default_rng(0)
     still = np.array([1.0, 2.0, A1.home_height, 1.0, 0.0, 0.0, 0.0, *A1.default_pose])
-    reference = Reference(task.options.load_clip(A1), still[:3])
+    reference = Reference(clip_of(task.options, A1), still[:3])
     found = [(still, np.zeros(18), np.zeros(12))]
     for step in range(1, STEPS + 1):
         reference.advance(found[-1][0][:3])
@@ -60,7 +61,7 @@ def reading_of(qpos: np.ndarray, qvel: np.ndarray) -> Reading:
 def test_the_observation_is_the_simulation_s_and_the_contract_s(
     task: Imitate, states: list[tuple[np.ndarray, ...]]
 ) -> None:
-    observer, clip = task.follower, task.options.load_clip(A1)
+    observer, clip = task.follower, clip_of(task.options, A1)
     ours = Follower(clip, reading_of(*states[0][:2]))
     contract = ready.find_contract("imitate", A1)
     brain = Brain(lambda obs, ticks, memory: (obs[:, :12], memory), None, 160)
@@ -111,7 +112,7 @@ def test_the_score_is_the_simulation_s(task: Imitate, states: list[tuple[np.ndar
         out = task.judge(world, view, FLAT)
         return out.reward, out.metrics["lost"], out.metrics["leaps"]
 
-    score = FollowScore("imitate", np.zeros(0), clip=task.options.load_clip(A1))
+    score = FollowScore("imitate", np.zeros(0), clip=clip_of(task.options, A1))
     start = jnp.asarray(states[0][0], jnp.float32)
     memory = observer.init(start, jnp.zeros(18))
     score.start(states[0][0][:3], np.zeros(2))

@@ -12,6 +12,7 @@ import pytest
 
 from twirl_mjx.commands import evaluate
 from twirl_mjx.commands.render import config_of, name_of
+from twirl_mjx.evaluation import shifts as scoring
 from twirl_mjx.figures.tables import read_episodes
 from twirl_mjx.files import FileError
 from twirl_mjx.policies.learned import PolicyFileError, PolicyHeader, save_policy
@@ -44,7 +45,7 @@ def scored(monkeypatch: pytest.MonkeyPatch) -> list[WorldConfig]:
         configs.append(config)
         return {shift: {"return": np.arange(float(episodes))} for shift in shifts}
 
-    monkeypatch.setattr(evaluate, "evaluate_shifts", score)
+    monkeypatch.setattr(scoring, "evaluate_shifts", score)
     return configs
 
 
@@ -79,14 +80,14 @@ def test_a_bad_name_is_found_before_anything_is_scored(
 def test_what_is_done_is_kept_when_a_later_policy_fails(
     scored: list[WorldConfig], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    score = evaluate.evaluate_shifts
+    score = scoring.evaluate_shifts
 
     def fail_later(config: WorldConfig, policy: Any, **words: Any) -> Any:
         if len(scored) == 2:
             raise RuntimeError("the third")
         return score(config, policy, **words)
 
-    monkeypatch.setattr(evaluate, "evaluate_shifts", fail_later)
+    monkeypatch.setattr(scoring, "evaluate_shifts", fail_later)
     out = tmp_path / "table.csv"
     out.write_text("of yesterday")
     with pytest.raises(ValueError, match=r"not written by this command.*table-2\.csv"):

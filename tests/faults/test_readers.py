@@ -22,7 +22,6 @@ from twirl_mjx.motion.formats import read_clip
 from twirl_mjx.policies.learned import load_policy
 from twirl_mjx.replay import dataset
 from twirl_mjx.sweep import gather, plan
-from twirl_mjx.sweep.plan import Cell
 from twirl_mjx.training import config_json
 from twirl_mjx.training.config import TrainConfig
 from twirl_mjx.training.rundir import Foreign, RunDir
@@ -30,7 +29,6 @@ from twirl_mjx.training.sinks.table import truncate_csv
 
 CURVE = "run,task,shift,variant,seed,metric,env_steps,grad_steps,wall_s,value\n"
 EPISODE = "run,task,shift,variant,seed,env_steps,episode,metric,value\n"
-CELL = Cell("a", "arm", "debug", TrainConfig(), "auto")
 
 
 def check_run(path: Path) -> None:
@@ -45,7 +43,7 @@ def check_run(path: Path) -> None:
 
 def curves(path: Path) -> None:
     (path.parent / "eval.csv").write_text(EPISODE + "a,b,c,d,0,1,0,return,1\n")
-    gather.curve_rows(CELL, path.parents[1])
+    gather.curve_rows(RunDir(path.parent))
 
 
 READERS: dict[str, tuple[str, Callable[[Path], object]]] = {
@@ -57,7 +55,7 @@ READERS: dict[str, tuple[str, Callable[[Path], object]]] = {
     "source": ("source.json", check_run),
     "evaluation": ("eval.csv", lambda path: RunDir(path.parent).finished()),
     "steps": ("eval.csv", lambda path: plan.evaluated_steps(path.parent)),
-    "episodes": ("eval.csv", lambda path: gather.episode_rows(CELL, path.parents[1])),
+    "episodes": ("eval.csv", lambda path: gather.episode_rows(RunDir(path.parent))),
     "curves": ("metrics.csv", curves),
     "resumed metrics": ("metrics.csv", lambda path: truncate_csv(path, 10)),
     "table": ("table.csv", read_table),

@@ -15,7 +15,8 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from twirl_mjx.assets import asset_path
 from twirl_mjx.motion.clip import Clip, configurations, frame_velocities, sample, slerp
-from twirl_mjx.motion.formats import Conversion, foot_paths, read_clip, write_clip
+from twirl_mjx.motion.conversion import Conversion
+from twirl_mjx.motion.formats import foot_paths, read_clip, write_clip
 from twirl_mjx.motion.plausible import check_plausible
 from twirl_mjx.sim.robots import A1
 

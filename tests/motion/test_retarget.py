@@ -16,7 +16,8 @@ from twirl_mjx.motion.plausible import check_plausible
 from twirl_mjx.motion.retarget import lowest_feet, read_motion, retarget, thigh_joints
 from twirl_mjx.sim.robot import Robot
 from twirl_mjx.sim.robots import A1
-from twirl_mjx.tasks.imitate import ImitateOptions, load_clip
+from twirl_mjx.tasks.cards import ImitateOptions
+from twirl_mjx.tasks.imitate import clip_of, load_clip
 
 BIG = dataclasses.replace(
     A1, name="big", thigh_length=0.25, calf_length=0.25, thigh_offset=1.25 * A1.thigh_offset,
@@ -98,9 +99,9 @@ def test_files_of_other_robots_are_checked_twice(leap: Clip, tmp_path: Path) -> 
 def test_the_task_follows_the_feet_of_another_robot(leap: Clip) -> None:
     with pytest.raises(ValueError, match=r"nearest: --imitate\.clip-robot a1"):
         load_clip("leap", BIG)
-    assert ImitateOptions(clip_robot="a1").load_clip(BIG).robot is BIG
+    assert clip_of(ImitateOptions(clip_robot="a1"), BIG).robot is BIG
     with pytest.raises(ValueError, match="nearest: 'a1'"):
-        ImitateOptions(clip_robot="a2").load_clip(A1)
+        clip_of(ImitateOptions(clip_robot="a2"), A1)
 
 
 def test_the_commands_call_the_gates(

@@ -11,23 +11,19 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from twirl_mjx.sim.dynamics import (
+from twirl_mjx.sim.dynamics import Dynamics, broadcast, draw, leaf_value, make_dynamics, stack
+from twirl_mjx.sim.leaves import (
     HILL_ANGLE,
     LEAVES,
     NOMINAL_VALUES,
     PAPER_SHIFTS,
     SHIFTS,
-    Dynamics,
     Shift,
-    broadcast,
     get_shift,
-    leaf_value,
-    make_dynamics,
     register_shift,
     shift_names,
-    stack,
 )
-from twirl_mjx.sim.ranges import NO_RANGES, Ranges, draw, parse_ranges
+from twirl_mjx.sim.ranges import NO_RANGES, Ranges, parse_ranges
 
 ROOT = Path(__file__).parents[2]
 

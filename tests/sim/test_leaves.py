@@ -14,7 +14,8 @@ import pytest
 
 from twirl_mjx.sim import actuation, engine, kinematics
 from twirl_mjx.sim.actuation import MotorCommand
-from twirl_mjx.sim.dynamics import LEAVES, Dynamics, broadcast, make_dynamics, stack
+from twirl_mjx.sim.dynamics import Dynamics, broadcast, make_dynamics, stack
+from twirl_mjx.sim.leaves import LEAVES
 from twirl_mjx.sim.robots import A1
 from twirl_mjx.sim.scene import Scene, build_scene
 

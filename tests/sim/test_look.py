@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from twirl_mjx.sim import look
-from twirl_mjx.sim.dynamics import PAPER_SHIFTS, get_shift, make_dynamics
+from twirl_mjx.sim.dynamics import make_dynamics
 from twirl_mjx.sim.engine import world_model
+from twirl_mjx.sim.leaves import PAPER_SHIFTS, get_shift
 from twirl_mjx.sim.robots import A1
 from twirl_mjx.sim.scene import Bands, build_scene, terrain_height
 

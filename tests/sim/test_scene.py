@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from twirl_mjx.sim import scene
-from twirl_mjx.sim.dynamics import SceneKind
 from twirl_mjx.sim.engine import write_physics
+from twirl_mjx.sim.leaves import SceneKind
 from twirl_mjx.sim.robots import A1
 from twirl_mjx.sim.scene import Bands, Scene, SimOptions, build_scene, terrain_height
 

@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from twirl_mjx.commands import sweep
+from twirl_mjx.commands import sweep, sweep_run
 from twirl_mjx.figures.tables import read_table
 from twirl_mjx.sweep import estimate, scheduler
 from twirl_mjx.sweep.grid import load
@@ -167,7 +167,7 @@ def test_a_cell_of_another_sweep_is_left_to_it(
                 other_sweep.close()
             return Ending(0, "here")
 
-    monkeypatch.setattr(sweep, "RayExecutor", Executor)
+    monkeypatch.setattr(sweep_run, "RayExecutor", Executor)
     monkeypatch.setattr(scheduler, "BUSY_LOOK_S", 0.0)
     argv = [str(grid_file), "--runs", str(runs), "--results", str(tmp_path / "results")]
     assert sweep.main(argv) == 0
@@ -192,7 +192,7 @@ def test_plain_lines_and_report(
     grid_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     cells = make_plan(load(str(grid_file)), tmp_path)
-    jobs = [sweep.job_of(cell, tmp_path) for cell in cells]
+    jobs = [sweep_run.job_of(cell, tmp_path) for cell in cells]
     table = {job.name: Progress(job) for job in jobs}
     times = {cell.name: estimate.Estimate(60.0, "default") for cell in cells}
     out = io.StringIO()
@@ -211,21 +211,21 @@ def test_plain_lines_and_report(
     assert "failed   biped-phi0.25 s0 | attempt 2 | exit status 1" in lines[1]
     for progress in list(table.values())[3:]:
         progress.state = "done"
-    assert sweep.report(table) == 1
+    assert sweep_run.report(table) == 1
     said = capsys.readouterr().out
     assert f"failed: {jobs[1].name}: exit status 1; log: {jobs[1].log}" in said
     assert "blocked" in said
     third.state = "busy"  # a sweep that was stopped while it waited
-    assert sweep.report(table) == 130
+    assert sweep_run.report(table) == 130
     second.state = third.state = "stopped"
-    assert sweep.report(table) == 130
+    assert sweep_run.report(table) == 130
     second.state = third.state = "done"
-    assert sweep.report(table) == 0
+    assert sweep_run.report(table) == 0
 
 
 def test_the_live_table_shows_running_cells(grid_file: Path, tmp_path: Path) -> None:
     cells = make_plan(load(str(grid_file)), tmp_path)
-    table = {cell.name: Progress(sweep.job_of(cell, tmp_path)) for cell in cells}
+    table = {cell.name: Progress(sweep_run.job_of(cell, tmp_path)) for cell in cells}
     times = {cell.name: estimate.Estimate(60.0, "default") for cell in cells}
     running = list(table.values())[1]
     running.state, running.attempts, running.began = "running", 2, 0.0
@@ -244,7 +244,7 @@ def test_the_live_table_shows_running_cells(grid_file: Path, tmp_path: Path) -> 
 
 def test_a_job_is_the_command_a_user_could_type(grid_file: Path, tmp_path: Path) -> None:
     cell = make_plan(load(str(grid_file)), tmp_path)[1]
-    job = sweep.job_of(cell, tmp_path)
+    job = sweep_run.job_of(cell, tmp_path)
     assert job.argv[:5] == ("-m", "twirl_mjx", "train", "--preset", "debug")
     assert job.log == str(tmp_path / cell.name / "sweep.log")
     assert job.needs == cell.needs != ()
@@ -261,10 +261,10 @@ def test_a_signal_reaches_the_sweep_although_ray_takes_it(monkeypatch: pytest.Mo
         return stop.wait(10.0)
 
     old = signal.getsignal(signal.SIGTERM)
-    monkeypatch.setattr(sweep, "RayExecutor", Taking)
-    monkeypatch.setattr(sweep, "run_all", run_all)
+    monkeypatch.setattr(sweep_run, "RayExecutor", Taking)
+    monkeypatch.setattr(sweep_run, "run_all", run_all)
     try:
         view: Any = SimpleNamespace(update=None, say=None)
-        assert sweep._run([], Path("runs"), sweep.SweepOptions("utd"), view)
+        assert sweep_run._run([], Path("runs"), sweep.SweepOptions("utd"), view)
     finally:
         signal.signal(signal.SIGTERM, old)

@@ -12,13 +12,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from twirl_mjx import cli
 from twirl_mjx.figures.cells import lead_metrics
 from twirl_mjx.figures.plots import make_figures, read_grids
 from twirl_mjx.figures.report import write_report
 from twirl_mjx.figures.summary import summarise
 from twirl_mjx.figures.tables import read_directory, read_episodes, read_table
 from twirl_mjx.sweep.describe import describe
-from twirl_mjx.sweep.gather import gather, nominal_notes, settings_of, thin
+from twirl_mjx.sweep.gather import gather, gather_runs, nominal_notes, settings_of, thin
 from twirl_mjx.sweep.grid import Grid, grids_folder, load
 from twirl_mjx.sweep.plan import Cell, make_plan
 
@@ -116,6 +117,32 @@ def test_tables_of_adaptation_name_the_nominal_run(tmp_path: Path, finish_run: F
     adapted = [cell for cell in cells if cell.is_shifted]
     others = [dataclasses.replace(adapted[0], source="/elsewhere/mine"), adapted[1]]
     assert nominal_notes(others) == [f"# nominal: mine, {nominal}"]
+
+
+def test_runs_by_themselves_are_reported(
+    plan_of: tuple[Grid, tuple[Cell, ...]],
+    tmp_path: Path,
+    finish_run: Finish,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    _, cells = plan_of
+    two = [cell for cell in cells if cell.config.task == "biped"][:2]
+    paths = [finish_run(cell, tmp_path / "runs") for cell in two]
+    folder = gather_runs(paths, tmp_path / "results")
+    arms = {re.sub(r"-s\d+$", "", path.name) for path in paths}
+    assert {p.name for p in folder.glob("*.csv")} == {
+        f"{arm}{suffix}.csv" for arm in arms for suffix in ("", ".episodes")
+    }
+    _, episodes = read_directory(folder)
+    assert episodes is not None and set(episodes["runs"]) == arms
+    page = tmp_path / "report.html"
+    words = ["report", "task:biped", "--runs", str(tmp_path / "runs"), "--out", str(page)]
+    assert cli.main(words) == 0
+    text = page.read_text(encoding="utf-8")
+    assert all(arm in text for arm in arms) and "2 runs" in text
+    (paths[0] / "eval.csv").unlink()
+    assert cli.main([*words, "--overwrite"]) == 2
+    assert f"{paths[0]} is not finished" in capsys.readouterr().err
 
 
 def test_a_changed_grid_leaves_no_old_tables(

@@ -8,7 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from twirl_mjx.commands.sweep import main, wanted
+from twirl_mjx.commands.sweep import main
+from twirl_mjx.commands.sweep_run import wanted
 from twirl_mjx.sweep import plan
 from twirl_mjx.sweep.grid import Draft, load
 from twirl_mjx.sweep.plan import Cell, make_plan, status_of

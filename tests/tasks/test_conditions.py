@@ -14,8 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from twirl_mjx.sim.dynamics import Dynamics, broadcast, make_dynamics
-from twirl_mjx.sim.ranges import NO_RANGES, Ranges, draw, parse_ranges
+from twirl_mjx.sim.dynamics import Dynamics, broadcast, draw, make_dynamics
+from twirl_mjx.sim.ranges import NO_RANGES, Ranges, parse_ranges
 from twirl_mjx.sim.robots import A1
 from twirl_mjx.tasks.observations import layout_noise, layout_slices, proprioceptive
 from twirl_mjx.worlds.vector import EnvState, VectorEnv

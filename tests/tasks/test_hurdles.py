@@ -14,7 +14,8 @@ from twirl_mjx.sim.dynamics import make_dynamics
 from twirl_mjx.sim.robots import A1
 from twirl_mjx.sim.scene import build_scene, terrain_height
 from twirl_mjx.tasks import base, rewards
-from twirl_mjx.tasks.hurdles import WEIGHTS, Hurdles, HurdlesOptions, HurdlesState, advance, watch
+from twirl_mjx.tasks.cards import HurdlesOptions
+from twirl_mjx.tasks.hurdles import WEIGHTS, Hurdles, HurdlesState, advance, watch
 from twirl_mjx.tasks.observations import layout_size, layout_slices
 
 FLAT = build_scene("flat")

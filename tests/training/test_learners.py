@@ -22,6 +22,7 @@ from twirl_mjx.policies.learned import load_policy
 from twirl_mjx.replay import ring
 from twirl_mjx.training import config_json, learners, loop, state, weights
 from twirl_mjx.training.config import TrainConfig
+from twirl_mjx.training.learner_check import check_learner
 from twirl_mjx.training.presets import make_config
 from twirl_mjx.training.run import Part
 from twirl_mjx.training.rundir import RunDir
@@ -208,7 +209,7 @@ def test_settings_without_what_training_reads_are_refused(kind: type, message: s
 
 @pytest.mark.parametrize("config", [DroqConfig(), DroqConfig(fast=False, utd=1.0)])
 def test_droq_keeps_what_the_protocol_asks(config: DroqConfig) -> None:
-    learners.check_learner(config, 7, 3)
+    check_learner(config, 7, 3)
 
 
 def wrong_init(key: jax.Array, config: CloneConfig, obs_size: int, action_size: int) -> CloneState:
@@ -255,5 +256,5 @@ def test_what_a_learner_returns_is_checked_before_anything_is_compiled(
     wrong = dataclasses.replace(CLONE, **{function: made})
     monkeypatch.setitem(learners.LEARNERS._items, wrong.name, wrong)
     with pytest.raises(ValueError, match=f"learner clone: {message}") as refusal:
-        learners.check_learner(CloneConfig(), 7, 3)
+        check_learner(CloneConfig(), 7, 3)
     assert "\n" not in str(refusal.value)

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from twirl_mjx.commands import runs as command
+from twirl_mjx.commands.selection import the_one
 from twirl_mjx.machine import try_lock
 from twirl_mjx.training import overview
 
@@ -88,6 +89,40 @@ def test_names_patterns_and_paths(tmp_path: Path) -> None:
         overview.find(tmp_path, ("biped-x",))
 
 
+def test_conditions_narrow_and_hold_together(tmp_path: Path) -> None:
+    a, b = make_run(tmp_path, "biped-a"), make_run(tmp_path, "biped-b", finished=False, utd=1.0)
+    assert overview.find(tmp_path, ("task:biped",)) == [a, b]
+    assert overview.find(tmp_path, ("status:finished", "seed:0")) == [a]
+    assert overview.find(tmp_path, ("biped-*", "droq.utd:1.0")) == [b]
+    assert overview.find(tmp_path, ("name:*-b", "status:finished")) == []
+    assert overview.find(tmp_path / "none", ("task:biped",)) == []
+    with pytest.raises(ValueError, match=r"condition on runs.*tsk.*nearest: 'task'"):
+        overview.find(tmp_path, ("tsk:biped",))
+
+
+def test_policies_keep_their_place_and_runs_become_paths(tmp_path: Path) -> None:
+    a, b = (str(make_run(tmp_path, f"biped-{name}")) for name in "ab")
+    file = str(tmp_path / "biped-a" / "policy.npz")
+    same = ["zero", file, "my.py:walk", "NAME=stand.npz"]
+    assert overview.expand(same, tmp_path) == same
+    assert overview.expand(["zero", "biped-*", file], tmp_path) == ["zero", a, b, file]
+    assert overview.expand(["biped-b", a], tmp_path) == [b, a]
+    assert overview.expand(["seed:0", "zero"], tmp_path) == [a, b, "zero"]
+    assert overview.expand(["biped-a"], tmp_path, but=("biped-a",)) == ["biped-a"]
+    with pytest.raises(FileNotFoundError, match=r"no run in .* fits seed:1"):
+        overview.expand(["zero", "seed:1"], tmp_path)
+
+
+def test_where_one_policy_is_meant(tmp_path: Path) -> None:
+    path = str(make_run(tmp_path, "trot"))
+    make_run(tmp_path, "bipeds")
+    assert the_one("trot", tmp_path) == "trot"  # a controller of that name goes before
+    assert the_one("name:trot", tmp_path) == path
+    assert the_one("nothing", tmp_path) == "nothing"  # the command says what it could be
+    with pytest.raises(ValueError, match=r"'\*' selects 2 runs, expected one: bipeds, trot"):
+        the_one("*", tmp_path)
+
+
 def test_differences(tmp_path: Path) -> None:
     paths = make_run(tmp_path, "a"), make_run(tmp_path, "b", utd=1.0)
     found = [overview.look(path) for path in paths]
@@ -142,6 +177,8 @@ def test_list_sorts_and_filters(tmp_path: Path, capsys: pytest.CaptureFixture[st
     assert names("--sort", "size") == ["b", "a"]
     assert names("--sort", "status") == ["a", "b"]
     assert names("--status", "finished") == ["a"]
+    assert names("status:finished", "task:biped") == ["a"]
+    assert names("--seed", "1") == []
     assert names("--variant", "scratch") == []
     assert names("list", "b") == ["b"]
     assert command.main(["--runs", str(tmp_path), "--sort", "name"]) == 0

@@ -15,20 +15,6 @@ from twirl_mjx.view.server import serving
 from twirl_mjx.view.stage import Stage
 
 
-def dark_share(picture: np.ndarray) -> float:
-    """Share of dark pixels, which only the robot has, in the middle of the picture."""
-    height, width = picture.shape[:2]
-    middle = picture[height // 4 : 3 * height // 4, width // 4 : 3 * width // 4]
-    return float((middle.max(axis=-1) < 90).mean())
-
-
-def wait_until(browser: Any, script: str, seconds: float = 30.0) -> None:
-    deadline = time.monotonic() + seconds
-    while not browser.run(script):
-        assert time.monotonic() < deadline, script
-        time.sleep(0.1)
-
-
 @pytest.mark.timeout(180)
 def test_a_replay_shows_the_robot_and_scrubs(browser: Any, tmp_path: Any) -> None:
     model = build_model(RehearsalConfig(), np.zeros(0))
@@ -37,14 +23,14 @@ def test_a_replay_shows_the_robot_and_scrubs(browser: Any, tmp_path: Any) -> Non
     path = write_replay(tmp_path / "replay.html", model, qpos, title="replay",
                         values={"x (m)": qpos[:, 0]})  # fmt: skip
     browser.open(path.as_uri())
-    wait_until(browser, "document.getElementById('clock').textContent.endsWith('2.00 s')")
-    assert dark_share(browser.picture()) > 0.005
+    browser.wait_until("document.getElementById('clock').textContent.endsWith('2.00 s')")
+    assert browser.dark_share() > 0.005
     browser.run("""(() => {
       document.getElementById('follow').checked = false;
       const time = document.getElementById('time');
       time.value = 1; time.dispatchEvent(new Event('input'));
     })()""")
-    wait_until(browser, "document.querySelector('#values td:last-child').textContent === '4.00'")
+    browser.wait_until("document.querySelector('#values td:last-child').textContent === '4.00'")
     time.sleep(0.5)
     assert browser.errors() == []
     urls = {
@@ -58,14 +44,14 @@ def test_a_replay_shows_the_robot_and_scrubs(browser: Any, tmp_path: Any) -> Non
 def test_the_live_page_shows_the_robot_and_its_controls_act(browser: Any, still: Stage) -> None:
     with serving(still, "live", port=0) as address:
         browser.open(address)
-        wait_until(browser, "document.querySelectorAll('#controls input').length > 5")
-        assert dark_share(browser.picture()) > 0.005
+        browser.wait_until("document.querySelectorAll('#controls input').length > 5")
+        assert browser.dark_share() > 0.005
         browser.run("""(() => {
           const slider = document.querySelector('input[name=gravity]');
           slider.value = 3.7; slider.dispatchEvent(new Event('change'));
           document.getElementById('pause').click();
         })()""")
-        wait_until(browser, "document.getElementById('pause').textContent === 'go on'")
+        browser.wait_until("document.getElementById('pause').textContent === 'go on'")
         frame = still.frame()
         assert frame["conditions"]["gravity"] == 3.7 and frame["paused"]
         goal = browser.run(f"view.pixelOf({frame['goal']})")
@@ -76,5 +62,5 @@ def test_the_live_page_shows_the_robot_and_its_controls_act(browser: Any, still:
         while still.frame()["goal"] == frame["goal"]:
             assert time.monotonic() < deadline
             time.sleep(0.1)
-        wait_until(browser, "document.getElementById('hint').textContent.startsWith('pull')")
+        browser.wait_until("document.getElementById('hint').textContent.startsWith('pull')")
         assert browser.errors() == []

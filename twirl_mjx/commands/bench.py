@@ -115,10 +115,10 @@ def _part(name: str, argv: list[str]) -> int:
 
 def _all(argv: list[str]) -> int:
     """Run every part within the time; returns 1 if the page keeps its tables, see ``doubts``."""
+    options = parse(AllBench, argv, "twirl bench")
     from twirl_mjx.bench import report
     from twirl_mjx.bench.measure import only_json_on_stdout
 
-    options = parse(AllBench, argv, "twirl bench")
     page = files.read_text(options.page, "a page with a marked section")
     files.check_ours(options.out, overwrite=options.overwrite)
     report.replace_section(page, "")  # refuses a page without markers before anything is measured

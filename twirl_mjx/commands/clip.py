@@ -106,7 +106,7 @@ def _check(argv: list[str], set_up: Callable[[bool], None]) -> int:
 
 def _read_all(options: CheckOptions) -> list[Clip]:
     """Return the clips as motions of the robot; the first that cannot be one is refused."""
-    from twirl_mjx.motion.formats import Conversion
+    from twirl_mjx.motion.conversion import Conversion
     from twirl_mjx.motion.retarget import read_motion
     from twirl_mjx.sim.robots import ROBOTS
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 from twirl_mjx.commands.console import say
 from twirl_mjx.commands.options import parse_collect
+from twirl_mjx.commands.selection import the_one
 from twirl_mjx.commands.waiting import waiting
-from twirl_mjx.tasks.imitate import ImitateOptions
+from twirl_mjx.tasks.cards import ImitateOptions
 from twirl_mjx.training.config import TrainConfig
 from twirl_mjx.training.presets import starts_from_nominal_run
 
@@ -18,7 +20,9 @@ def main(argv: list[str]) -> int:
     with waiting("loading the trainer"):  # orbax and more, which options do not need
         from twirl_mjx.training import memory, pipeline, rundir
         from twirl_mjx.training.sinks.registry import resolve
-    config = options.config
+    config = dataclasses.replace(
+        options.config, source=the_one(options.config.source, options.runs)
+    )
     check_source(config, options.preset)
     memory.check([memory.collecting(config)])
     sinks = resolve(options.log)

@@ -11,11 +11,10 @@ import tyro
 from twirl_mjx.checks import check_choice, check_once
 from twirl_mjx.commands.console import parse, say
 from twirl_mjx.commands.options import default_preset
-from twirl_mjx.sim.dynamics import PAPER_SHIFTS, SHIFTS
+from twirl_mjx.sim.leaves import PAPER_SHIFTS, SHIFTS
 from twirl_mjx.sweep.grid import configure
 from twirl_mjx.tasks.registry import TASKS
 from twirl_mjx.tasks.task import Link
-from twirl_mjx.training import pipeline, rundir
 from twirl_mjx.training.config import TrainConfig
 from twirl_mjx.training.presets import PRESETS
 
@@ -64,6 +63,8 @@ def plan(options: CurriculumOptions, preset: str) -> list[tuple[str, TrainConfig
 
     All shifts start from the run of the target task.
     """
+    from twirl_mjx.training.rundir import default_name  # needs jax, which options do not
+
     links: list[tuple[str, TrainConfig]] = []
     task = TASKS.admit(options.task)
     for name, settings in chain_of(task)[-1:] if options.source else chain_of(task):
@@ -71,7 +72,7 @@ def plan(options: CurriculumOptions, preset: str) -> list[tuple[str, TrainConfig
         config = configure(preset, {**settings, **source, "seed": options.seed}, f"link {name}")
         chained = f"{name}-chain-{preset}-s{options.seed}"
         # The first link is the run of `twirl train`, which may be there already.
-        links.append((chained if links else rundir.default_name(config, preset), config))
+        links.append((chained if links else default_name(config, preset), config))
     target, config = links[-1]
     budget = min(ADAPTATION_ENV_STEPS, config.total_env_steps)
     for shift in options.shifts:
@@ -115,6 +116,8 @@ def main(argv: list[str]) -> int:
     check_choice("preset", preset, PRESETS)
     options = dataclasses.replace(options, shifts=tuple(map(SHIFTS.admit, options.shifts)))
     check_once("--shifts", options.shifts)
+    from twirl_mjx.training import pipeline
+
     links = plan(options, preset)
     for number, (name, config) in enumerate(links, 1):
         say(f"link {number} of {len(links)}: {name}")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import importlib
 import shlex
 import sys
 import time
@@ -20,10 +21,11 @@ from twirl_mjx.checks import check_once, check_range
 from twirl_mjx.commands.console import say
 from twirl_mjx.commands.options import Overrides, parse_in_tasks, with_overrides
 from twirl_mjx.commands.render import config_of
+from twirl_mjx.commands.selection import selected
 from twirl_mjx.commands.tables import check_settings, named, write_rows
-from twirl_mjx.evaluation.shifts import evaluate_shifts, scenes_of
+from twirl_mjx.commands.waiting import waiting
 from twirl_mjx.figures.statistics import bootstrap, mean
-from twirl_mjx.sim.dynamics import PAPER_SHIFTS, SHIFTS
+from twirl_mjx.sim.leaves import PAPER_SHIFTS, SHIFTS
 from twirl_mjx.tasks.task import Task
 from twirl_mjx.worlds.config import WorldConfig
 
@@ -43,8 +45,11 @@ class EvaluateOptions:
     """
 
     policies: Annotated[tuple[str, ...], tyro.conf.Positional]
-    """Run directories, policy files (.npz, .onnx), file.py:function or scripted names (trot, bound,
-    zero, random, clip); NAME=POLICY gives it a name in the table, such as source=stand.npz."""
+    """Runs (names, patterns, conditions such as task:biped seed:0, directories), policy files
+    (.npz, .onnx), file.py:function or scripted names (trot, bound, zero, random, clip);
+    NAME=POLICY gives it a name in the table, such as source=stand.npz."""
+    runs: Path = Path("runs")
+    """Folder of all runs."""
     task: str | None = None
     """Task to act in; the one a policy was trained for by default."""
     shifts: tuple[str, ...] = PAPER_SHIFTS
@@ -104,7 +109,10 @@ def main(argv: list[str]) -> int:
     out = options.out or Path("runs", f"evaluation-{time.strftime('%Y%m%d-%H%M%S')}.csv")
     check_outputs(out, options.figure, options.overwrite)
     settings = check_settings(options.setting)
+    with waiting("loading jax and MuJoCo"):  # which options do not need
+        importlib.import_module("twirl_mjx.evaluation.shifts")
     check_memory(options)
+    options = dataclasses.replace(options, policies=selected(options.policies, options.runs))
     candidates = resolve_all(options, overrides)
     notes = f"# command: {shlex.join(['.venv/bin/twirl', 'evaluate', *argv])}\n"
     rows: list[list[object]] = []
@@ -140,6 +148,7 @@ def check_outputs(out: Path, figure: Path | None, overwrite: bool = False) -> No
 
 def check_memory(options: EvaluateOptions) -> None:
     """Refuse more episodes than fit into memory: conditions on one ground run at once."""
+    from twirl_mjx.evaluation.shifts import scenes_of
     from twirl_mjx.training import memory
 
     at_once = options.episodes * max(map(len, scenes_of(options.shifts).values()))
@@ -179,6 +188,8 @@ def resolve_all(options: EvaluateOptions, overrides: Overrides) -> list[Candidat
 
 def _evaluate_one(candidate: Candidate, options: EvaluateOptions) -> list[list[object]]:
     """Evaluate one policy and print its table; return its rows."""
+    from twirl_mjx.evaluation.shifts import evaluate_shifts
+
     config, found = candidate.config, candidate.found
     conditions = len(options.shifts)
     say(

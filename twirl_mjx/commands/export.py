@@ -9,14 +9,15 @@ from typing import Annotated
 import tyro
 
 from twirl_mjx.commands.console import parse, say
+from twirl_mjx.commands.selection import the_one
 
 
 @dataclasses.dataclass(frozen=True)
 class ExportOptions:
     """Write a policy as an ONNX file, checked against the original, and its contract.json."""
 
-    policy: Annotated[Path, tyro.conf.Positional]
-    """Run directory or policy file (.npz)."""
+    policy: Annotated[str, tyro.conf.Positional]
+    """Run (name or directory) or policy file (.npz)."""
     out: Path = Path("policy.onnx")
     """File to write; contract.json, which says how the policy meets its robot, goes beside it."""
     robot: str = ""
@@ -30,7 +31,8 @@ def main(argv: list[str]) -> int:
     options = parse(ExportOptions, argv, "twirl export")
     from twirl_mjx.deploy.export import export
 
-    done = export(options.policy, options.out, robot=options.robot, overwrite=options.overwrite)
+    policy = Path(the_one(options.policy))
+    done = export(policy, options.out, robot=options.robot, overwrite=options.overwrite)
     say(f"wrote {done.onnx}")
     say(f"wrote {done.contract}" if done.contract else f"no contract: {done.why}")
     return 0

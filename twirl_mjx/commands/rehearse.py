@@ -14,6 +14,8 @@ import tyro
 from twirl_mjx import files
 from twirl_mjx.checks import check_range
 from twirl_mjx.commands.console import json_text, say
+from twirl_mjx.commands.options import parse_in_tasks
+from twirl_mjx.commands.selection import the_one
 from twirl_mjx.commands.tables import check_settings, named, write_rows
 from twirl_mjx.deploy.conditions import RehearsalConfig
 
@@ -32,8 +34,8 @@ class RehearseOptions:
     """
 
     policy: Annotated[str, tyro.conf.Positional]
-    """Run directory, policy file (.npz, .onnx), file.py:function or scripted name; NAME=POLICY
-    gives it another name in the table."""
+    """Run (name or directory), policy file (.npz, .onnx), file.py:function or scripted name;
+    NAME=POLICY gives it another name in the table."""
     task: str | None = None
     """Task; the one the policy was trained for by default."""
     episodes: int = 8
@@ -63,21 +65,19 @@ def main(argv: list[str], set_up: Callable[[bool], None]) -> int:
 
     Args:
         argv: Options.
-        set_up: Gets whether anything is drawn, before the simulation is imported.
+        set_up: Gets whether anything is drawn, before MuJoCo is imported.
     """
-    is_help = bool({"-h", "--help"} & set(argv))
-    set_up(not is_help and any(word.split("=")[0] == "--film" for word in argv))
-    from twirl_mjx.commands.options import parse_in_tasks
-    from twirl_mjx.deploy.rehearsal import rehearse
-    from twirl_mjx.policies.resolve import Terms
-
     options, overrides = parse_in_tasks(RehearseOptions, argv, "twirl rehearse")
     check_range("episodes", options.episodes, 1, 100_000)
     check_range("seed", options.seed, 0, 2**32 - 1)
-    run, policy = named(options.policy)
+    run, policy = named(the_one(options.policy))
     settings = check_settings(options.setting)
     if settings and (options.out is None or options.out.suffix != ".csv"):
         raise ValueError("--setting is a column of a table (nearest: --out rehearsal.csv)")
+    set_up(options.film is not None)
+    from twirl_mjx.deploy.rehearsal import rehearse
+    from twirl_mjx.policies.resolve import Terms
+
     check_targets(options.out, options.film, options.overwrite)
     result = rehearse(
         policy,

@@ -14,6 +14,7 @@ import tyro
 from twirl_mjx import files
 from twirl_mjx.checks import check_range
 from twirl_mjx.commands.console import say
+from twirl_mjx.commands.selection import the_one
 from twirl_mjx.plugins import is_reference
 from twirl_mjx.policies.learned import BEST_POLICY, LAST_POLICY
 
@@ -32,7 +33,7 @@ class RenderOptions:
     """Film one episode of a policy, without a display: a film and a strip of frames."""
 
     policy: Annotated[str, tyro.conf.Positional]
-    """Run directory, policy file (.npz, .onnx), file.py:function or scripted name."""
+    """Run (name or directory), policy file (.npz, .onnx), file.py:function or scripted name."""
     task: str | None = None
     """Task to act in; the one the policy was trained for by default."""
     shift: str | None = None
@@ -71,12 +72,13 @@ def main(argv: list[str], set_up: Callable[[bool], None]) -> int:
 
     Args:
         argv: Options.
-        set_up: Gets whether anything is drawn, before the simulation is imported.
+        set_up: Gets whether anything is drawn, before MuJoCo is imported.
     """
-    set_up(not {"-h", "--help"} & set(argv))
     from twirl_mjx.commands.options import parse_in_tasks, with_overrides
 
     options, overrides = parse_in_tasks(RenderOptions, argv, "twirl render")
+    options = dataclasses.replace(options, policy=the_one(options.policy))
+    set_up(True)
     config = with_overrides(config_of(options.policy, options.task), overrides)
     if options.shift is not None:
         config = dataclasses.replace(config, shift=options.shift)

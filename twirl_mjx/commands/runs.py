@@ -22,10 +22,12 @@ USAGE = """usage: twirl runs [NAMES] [options]          list runs
        twirl runs prune [NAMES] [options]    delete checkpoints and collected experience of finished
                                              runs; says what, and asks for --yes
 
-NAMES are names in the folder of all runs, shell patterns of them, or paths.
+NAMES are names in the folder of all runs, shell patterns of them, paths, or conditions such as
+task:biped status:finished seed:0 droq.utd:0.5, all of which hold. Other commands take them, too.
 `twirl runs list --help` (show, compare, prune) lists the options.
 """
 Key = Literal["name", "task", "status", "steps", "best", "age", "size"]
+FILTERS = ("task", "variant", "shift", "status", "seed")
 KEYS: dict[Key, Callable[[Overview], Any]] = {
     "name": lambda run: run.name,
     "task": lambda run: (str(run.setting("task")), run.name),
@@ -43,7 +45,8 @@ class ListOptions:
     """List runs."""
 
     names: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
-    """Names, patterns such as 'biped-*', or paths; all by default."""
+    """Names, patterns such as 'biped-*', paths, or conditions such as task:biped seed:0; all by
+    default."""
     runs: Path = Path("runs")
     """Folder of all runs."""
     sort: Key = "age"
@@ -56,6 +59,8 @@ class ListOptions:
     """Only runs under this shift, none for those without."""
     status: overview.State | None = None
     """Only runs in this state."""
+    seed: int | None = None
+    """Only runs with this seed."""
     json: bool = False
     """Print one JSON document instead."""
 
@@ -75,7 +80,7 @@ class CompareOptions:
     """Show in which settings runs differ, and how they did."""
 
     names: Annotated[tuple[str, ...], tyro.conf.Positional]
-    """Names, patterns or paths of two or more."""
+    """Names, patterns, paths or conditions of two or more."""
     runs: Path = Path("runs")
     """Folder of all runs."""
 
@@ -89,7 +94,7 @@ class PruneOptions:
     """
 
     names: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
-    """Names, patterns or paths; all finished runs by default."""
+    """Names, patterns, paths or conditions; all finished runs by default."""
     runs: Path = Path("runs")
     """Folder of all runs."""
     yes: bool = False
@@ -112,12 +117,9 @@ def _console() -> Console:
 
 def _list(argv: list[str]) -> int:
     options = parse(ListOptions, argv, "twirl runs list")
-    found = [overview.look(path) for path in overview.find(options.runs, options.names)]
-    for name in ("task", "variant", "shift"):
-        if (wanted := getattr(options, name)) is not None:
-            found = [run for run in found if run.setting(name) == wanted]
-    if options.status is not None:
-        found = [run for run in found if run.state == options.status]
+    asked = {name: getattr(options, name) for name in FILTERS}
+    words = [f"{name}:{value}" for name, value in asked.items() if value is not None]
+    found = [overview.look(path) for path in overview.find(options.runs, [*options.names, *words])]
     found.sort(key=KEYS[options.sort])
     if options.json:
         say(json_text([_record(run) for run in found]))

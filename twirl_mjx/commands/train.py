@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 from twirl_mjx.commands.console import say
 from twirl_mjx.commands.options import parse_train
+from twirl_mjx.commands.selection import the_one
 from twirl_mjx.commands.waiting import waiting
 
 
@@ -12,8 +15,11 @@ def main(argv: list[str]) -> int:
     options = parse_train(argv)
     with waiting("loading the trainer"):  # orbax and more, which options do not need
         from twirl_mjx.training import pipeline
+    config = dataclasses.replace(
+        options.config, source=the_one(options.config.source, options.runs)
+    )
     run_dirs = pipeline.run_seeds(
-        options.config,
+        config,
         options.seeds or None,
         options.preset,
         options.runs,

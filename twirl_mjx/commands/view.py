@@ -16,6 +16,7 @@ from twirl_mjx.assets import asset_path
 from twirl_mjx.checks import check_choice, check_range
 from twirl_mjx.commands.console import parse, say
 from twirl_mjx.commands.render import FILM_SECONDS, RenderOptions, config_of, record
+from twirl_mjx.commands.selection import the_one
 from twirl_mjx.deploy.conditions import CONTROL_HZ, SHIFTS, RehearsalConfig
 from twirl_mjx.deploy.reference import BIPED, TASKS
 from twirl_mjx.policies.learned import BEST_POLICY, LAST_POLICY, resolve_policy_path
@@ -46,7 +47,7 @@ class ViewOptions:
     """
 
     policy: Annotated[str, tyro.conf.Positional] = ""
-    """Run directory, policy file (.npz, .onnx), file.py:function or scripted name; the shipped
+    """Run, policy file (.npz, .onnx), file.py:function or scripted name; the shipped
     biped by default. For --html also a policy of a task of your own, a clip, or a trace: an .npz
     with qpos [T, 19]."""
     html: Path | None = None
@@ -86,6 +87,7 @@ class ViewOptions:
 def main(argv: list[str]) -> int:
     """Serve a page until interrupted, or write a replay."""
     options = parse(ViewOptions, argv, "twirl view")
+    options = dataclasses.replace(options, policy=the_one(options.policy))
     if options.html is not None:
         from twirl_mjx.view.page import check_page
 

@@ -29,7 +29,8 @@ from twirl_mjx.policies.resolve import (
     robot_of_card,
 )
 from twirl_mjx.sim.robots import A1
-from twirl_mjx.tasks.imitate import ImitateOptions
+from twirl_mjx.tasks.cards import ImitateOptions
+from twirl_mjx.tasks.imitate import clip_of
 from twirl_mjx.tasks.registry import TASKS as ALL_TASKS
 from twirl_mjx.types import SourcePolicy
 from twirl_mjx.worlds.config import WorldConfig
@@ -62,7 +63,7 @@ class OwnPilot:
     def __init__(self, policy: Any, task: str, options: Any) -> None:
         """Keep the policy, and load the clip of ``imitate``."""
         self.policy, self.task, self.options = policy, task, options
-        self.clip = options.load_clip(A1) if isinstance(options, ImitateOptions) else None
+        self.clip = clip_of(options, A1) if isinstance(options, ImitateOptions) else None
 
     def reset(self, reading: Reading) -> None:
         """Begin an episode; ``policy.reset()`` is called when it has one."""

@@ -60,13 +60,13 @@ class CommandFilter:
         """Start at rest at ``joint_pos`` [12] rad."""
         from scipy.signal import butter
 
-        self._b, self._a = np.asarray(butter(2, 4.0, fs=CONTROL_HZ))
+        self.b, self.a = np.asarray(butter(2, 4.0, fs=CONTROL_HZ))
         self._in, self._out = [joint_pos.copy()] * 2, [joint_pos.copy()] * 2
 
     def __call__(self, action: np.ndarray) -> np.ndarray:
         """Return the joint target [12] rad for an action [12] in [-1, 1]."""
         new = POSE + SWING * np.clip(action, -1.0, 1.0)
-        inputs, (b, a) = [new, *self._in], (self._b, self._a)
+        inputs, (b, a) = [new, *self._in], (self.b, self.a)
         forward = sum(k * x for k, x in zip(b, inputs, strict=True))
         out = forward - sum(k * y for k, y in zip(a[1:], self._out, strict=True))
         self._in, self._out = inputs[:2], [out, self._out[0]]

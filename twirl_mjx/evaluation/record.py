@@ -11,8 +11,8 @@ import mujoco
 import numpy as np
 
 from twirl_mjx.sim import look
-from twirl_mjx.sim.dynamics import get_shift
 from twirl_mjx.sim.engine import world_model
+from twirl_mjx.sim.leaves import get_shift
 from twirl_mjx.sim.robot import NUM_LEGS, Robot
 from twirl_mjx.sim.scene import Bands, build_scene
 from twirl_mjx.tasks.base import ground_at

@@ -9,7 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from twirl_mjx.evaluation.rollout import evaluate_policy
-from twirl_mjx.sim.dynamics import PAPER_SHIFTS, SceneKind, get_shift, stack
+from twirl_mjx.sim.dynamics import stack
+from twirl_mjx.sim.leaves import PAPER_SHIFTS, SceneKind, get_shift
 from twirl_mjx.types import SourcePolicy
 from twirl_mjx.worlds.config import WorldConfig
 from twirl_mjx.worlds.make import make_env

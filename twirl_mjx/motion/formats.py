@@ -22,7 +22,6 @@ its robot. Whether a clip can be a motion at all: ``plausible``.
 from __future__ import annotations
 
 import csv
-import dataclasses
 import json
 import math
 from collections.abc import Sequence
@@ -32,62 +31,18 @@ from typing import Any, Literal
 import numpy as np
 
 from twirl_mjx import array_files, files
-from twirl_mjx.checks import check_choice, check_range
 from twirl_mjx.motion.clip import Clip, LoopMode, frame_velocities, rotation_of
+from twirl_mjx.motion.conversion import AS_IS, NUM_JOINTS, POSE_SIZE, Conversion
 from twirl_mjx.sim import kinematics
 from twirl_mjx.sim.robot import LEG_SIZE, NUM_LEGS, ROOT_SIZE, Robot
 from twirl_mjx.sim.robots import A1
 
 Layout = Literal["peng", "amp"]
-NUM_JOINTS = NUM_LEGS * LEG_SIZE
-POSE_SIZE = ROOT_SIZE + NUM_JOINTS
-"""Numbers of a configuration."""
 FRAME_SIZES: dict[str, int] = {"peng": POSE_SIZE, "amp": POSE_SIZE + 3 * NUM_JOINTS + 6}
 """Numbers in a frame."""
 CORNERS = ("FR", "FL", "RR", "RL")
 """Legs of a file in their order: front right, front left, hind right, hind left."""
 LOOP_MODES: dict[str, LoopMode] = {"Wrap": "wrap", "Clamp": "clamp"}
-LAIKAGO = np.full(4, 0.5)
-"""Root of a Laikago that stands upright in files of Peng et al.; ours is the identity then."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Conversion:
-    """What a file has other than radians, metres, x y z w, a root with z up and its own rate."""
-
-    degrees: bool = False
-    """Joint angles are in degrees."""
-    metres: float = 1.0
-    """m per unit of the root position: 0.01 for centimetres."""
-    quaternion: Literal["xyzw", "wxyz"] = "xyzw"
-    """Order of the numbers of a quaternion."""
-    root: Literal["a1", "laikago"] = "a1"
-    """Frame of the root: x forward and z up, or that of a Laikago."""
-    fps: float = 0.0
-    """Frames per second, instead of ``FrameDuration``; 0 to keep that."""
-
-    def __post_init__(self) -> None:
-        """Check every value, or raise ValueError."""
-        check_range("clip metres", self.metres, 1e-6, 100.0)
-        check_choice("clip quaternion", self.quaternion, ("xyzw", "wxyz"))
-        check_choice("clip root", self.root, ("a1", "laikago"))
-        check_range("clip fps", self.fps, 0.0, 10_000.0)
-
-    def apply(self, frames: np.ndarray) -> np.ndarray:
-        """Return frames [F, 19 or more] in our units and frames."""
-        out = frames.copy()
-        out[:, :3] *= self.metres
-        if self.quaternion == "wxyz":
-            out[:, 3:7] = frames[:, [4, 5, 6, 3]]
-        if self.root == "laikago":
-            turned = rotation_of(out[:, [6, 3, 4, 5]]) * rotation_of(LAIKAGO).inv()
-            out[:, 3:7] = turned.as_quat()
-        if self.degrees:
-            out[:, ROOT_SIZE:POSE_SIZE] = np.deg2rad(frames[:, ROOT_SIZE:POSE_SIZE])
-        return out
-
-
-AS_IS = Conversion()
 
 
 def read_clip(

@@ -15,7 +15,8 @@ from pathlib import Path
 import numpy as np
 
 from twirl_mjx.motion.clip import Clip, rotation_of
-from twirl_mjx.motion.formats import AS_IS, Conversion, foot_arms, read_clip
+from twirl_mjx.motion.conversion import AS_IS, Conversion
+from twirl_mjx.motion.formats import foot_arms, read_clip
 from twirl_mjx.motion.plausible import check_plausible
 from twirl_mjx.sim import kinematics
 from twirl_mjx.sim.robot import Robot

@@ -32,7 +32,8 @@ from twirl_mjx.policies.onnx_file import OnnxPolicy
 from twirl_mjx.policies.ready import find_contract
 from twirl_mjx.policies.source import ActOnObs, ObservingSource, OwnTaskSource, actor_act
 from twirl_mjx.sim.robots import A1, ROBOTS
-from twirl_mjx.tasks.imitate import ImitateOptions
+from twirl_mjx.tasks.cards import ImitateOptions
+from twirl_mjx.tasks.imitate import clip_of
 from twirl_mjx.tasks.observations import layout_size
 from twirl_mjx.tasks.registry import TASKS
 from twirl_mjx.types import SourcePolicy, Transition
@@ -332,7 +333,7 @@ def _scripted(name: str, config: WorldConfig) -> Source:
         return Source(
             scripted.get_scripted(name, ROBOTS.get(config.robot)), f"scripted {name}", name
         )
-    clip = clip_options(config).load_clip(ROBOTS.get(config.robot))
+    clip = clip_of(clip_options(config), ROBOTS.get(config.robot))
     content = hashlib.sha256(clip.qpos.tobytes()).hexdigest()[:12]
     return Source(ClipPolicy(clip), f"scripted {name}", f"clip {content}")
 

@@ -12,7 +12,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from twirl_mjx.sim.dynamics import Dynamics, Place
+from twirl_mjx.sim.dynamics import Dynamics
+from twirl_mjx.sim.leaves import Place
 from twirl_mjx.sim.robot import LEG_SIZE, NUM_LEGS, Robot
 
 AMBIENT_TEMPERATURE = 25.0

@@ -23,7 +23,8 @@ import numpy as np
 from twirl_mjx.machine import usable_cores
 from twirl_mjx.sim import actuation, mjx
 from twirl_mjx.sim.actuation import MOTOR_PLACES, MotorCommand
-from twirl_mjx.sim.dynamics import LEAVES, Dynamics, Target, targets, trunk
+from twirl_mjx.sim.dynamics import Dynamics, Target, targets
+from twirl_mjx.sim.leaves import LEAVES, trunk
 from twirl_mjx.sim.scene import Scene
 
 EngineName = Literal["auto", "mjx", "native"]

@@ -12,15 +12,8 @@ import math
 import mujoco
 import numpy as np
 
-from twirl_mjx.sim.dynamics import (
-    LEAVES,
-    NOMINAL_VALUES,
-    PAPER_SHIFTS,
-    Dynamics,
-    SceneKind,
-    get_shift,
-    leaf_value,
-)
+from twirl_mjx.sim.dynamics import Dynamics, leaf_value
+from twirl_mjx.sim.leaves import LEAVES, NOMINAL_VALUES, PAPER_SHIFTS, SceneKind, get_shift
 from twirl_mjx.sim.robot import Robot
 
 LOW, HIGH = np.array([0.36, 0.27, 0.20]), np.array([0.97, 0.91, 0.76])

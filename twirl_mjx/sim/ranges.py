@@ -1,13 +1,11 @@
-"""Domain randomisation: leaves of ``Dynamics`` that are drawn anew for every episode."""
+"""Domain randomisation: leaves that are drawn anew for every episode (``dynamics.draw``)."""
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
 
-import jax
-
-from twirl_mjx.sim.dynamics import LEAF, Dynamics, SceneKind, check_leaf
+from twirl_mjx.sim.leaves import LEAF, SceneKind, check_leaf
 
 
 @dataclasses.dataclass(frozen=True)
@@ -77,22 +75,3 @@ def parse_ranges(texts: Sequence[str]) -> Ranges:
                 f"{text!r} {what}: write leaf=low:high, for example friction=0.4:1.25"
             ) from None
     return Ranges(tuple(bounds))
-
-
-def draw(key: jax.Array, dynamics: Dynamics, ranges: Ranges) -> Dynamics:
-    """Return one world's parameters with the leaves of ``ranges`` drawn uniformly.
-
-    Args:
-        key: PRNG key; a leaf's draw depends on no other leaf.
-        dynamics: Scalars, kept where nothing is drawn.
-        ranges: What to draw.
-    """
-    order = list(LEAF)
-    return dynamics.replace(
-        **{
-            name: jax.random.uniform(
-                jax.random.fold_in(key, order.index(name)), minval=low, maxval=high
-            )
-            for name, low, high in ranges.bounds
-        }
-    )

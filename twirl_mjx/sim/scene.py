@@ -14,7 +14,7 @@ import mujoco
 import numpy as np
 
 from twirl_mjx.sim import look, mjx
-from twirl_mjx.sim.dynamics import HILL_ANGLE, SceneKind
+from twirl_mjx.sim.leaves import HILL_ANGLE, SceneKind
 from twirl_mjx.sim.mjcf import robot_spec
 from twirl_mjx.sim.robot import BODY_CLASSES, CALF, CONTROL_DT, FOOT, Robot
 from twirl_mjx.sim.robots import A1

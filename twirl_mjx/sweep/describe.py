@@ -18,7 +18,7 @@ from typing import Any
 from twirl_mjx import files
 from twirl_mjx.figures.facts import DOES_NOTHING, FILE
 from twirl_mjx.figures.tables import read_directory, sort_key
-from twirl_mjx.sim.dynamics import shift_names
+from twirl_mjx.sim.leaves import shift_names
 from twirl_mjx.tasks.measures import SUCCESS, measures_of
 from twirl_mjx.tasks.registry import TASKS
 from twirl_mjx.training.config import VARIANTS

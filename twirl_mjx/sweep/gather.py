@@ -9,13 +9,14 @@ a smoke grid are no results: they stay in ``runs/smoke/``.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from twirl_mjx import files
 from twirl_mjx.figures.facts import EVALUATION, FILE
 from twirl_mjx.figures.tables import CURVE_COLUMNS, EPISODE_COLUMNS
-from twirl_mjx.sweep.describe import facts, text_of
+from twirl_mjx.sweep.describe import describe, facts, text_of
 from twirl_mjx.sweep.grid import Grid
 from twirl_mjx.sweep.plan import Cell, is_finished
 from twirl_mjx.training.rundir import RunDir
@@ -56,8 +57,9 @@ def gather(grid: Grid, cells: Sequence[Cell], runs: Path, results: Path) -> list
         if not finished:
             continue
         notes = notes_of(grid, len(finished), len(mine)) + nominal_notes(finished)
-        curves = [row | settings[arm] for cell in finished for row in curve_rows(cell, runs)]
-        episodes = [row | settings[arm] for cell in finished for row in episode_rows(cell, runs)]
+        dirs = [RunDir(runs / cell.name) for cell in finished]
+        curves = [row | settings[arm] for run in dirs for row in curve_rows(run)]
+        episodes = [row | settings[arm] for run in dirs for row in episode_rows(run)]
         for suffix, header, rows in (
             ("", CURVE_COLUMNS, curves),
             (".episodes", EPISODE_COLUMNS, episodes),
@@ -135,22 +137,21 @@ def stale_tables(folder: Path, grid: Grid, arms: set[str]) -> list[Path]:
     return stale
 
 
-def curve_rows(cell: Cell, runs: Path) -> list[Row]:
+def curve_rows(run: RunDir) -> list[Row]:
     """Return what a run reports of episodes while it trains; the evaluation at 0 if untrained."""
-    path = RunDir(runs / cell.name).metrics
-    if cell.config.variant == "zero-shot" or not path.is_file():
-        return _untrained_rows(cell, runs)
-    measures = {row["metric"] for row in episode_rows(cell, runs)}
+    rows = episode_rows(run)
+    if not run.metrics.is_file() or all(row["variant"] == "zero-shot" for row in rows):
+        return _untrained_rows(rows)
+    measures = {row["metric"] for row in rows}
     series: dict[str, list[Row]] = {}
-    for row in files.read_rows(path, "the metrics of a run", cells_of(CURVE_COLUMNS)):
+    for row in files.read_rows(run.metrics, "the metrics of a run", cells_of(CURVE_COLUMNS)):
         if row["metric"].removeprefix(EVALUATION) in measures:
             series.setdefault(row["metric"], []).append(row)
     return [row for rows in series.values() for row in thin(rows)]
 
 
-def _untrained_rows(cell: Cell, runs: Path) -> list[Row]:
+def _untrained_rows(rows: Sequence[Row]) -> list[Row]:
     values: dict[str, list[float]] = {}
-    rows = episode_rows(cell, runs)
     for row in rows:
         values.setdefault(row["metric"], []).append(float(row["value"]))
     return [
@@ -161,10 +162,39 @@ def _untrained_rows(cell: Cell, runs: Path) -> list[Row]:
     ]
 
 
-def episode_rows(cell: Cell, runs: Path) -> list[Row]:
+def episode_rows(run: RunDir) -> list[Row]:
     """Return every measure of every episode of a run's final evaluation."""
-    path = RunDir(runs / cell.name).episodes
-    return files.read_rows(path, "the evaluation of a run", cells_of(EPISODE_COLUMNS))
+    return files.read_rows(run.episodes, "the evaluation of a run", cells_of(EPISODE_COLUMNS))
+
+
+def gather_runs(paths: Sequence[Path], results: Path) -> Path:
+    """Write the tables of finished runs, one arm for those of one name but for the seed.
+
+    Returns:
+        The folder of the tables, in ``results``.
+
+    Raises:
+        ValueError: No run, or one that is not finished.
+    """
+    arms: dict[str, list[RunDir]] = {}
+    for run in map(RunDir, paths):
+        if not run.episodes.is_file():
+            raise ValueError(f"{run} is not finished, and only finished runs are reported"
+                             " (nearest: status:finished)")  # fmt: skip
+        arms.setdefault(re.sub(r"-s\d+$", "", run.name), []).append(run)
+    if not arms:
+        raise ValueError("no run to report")
+    folder = results / "runs"
+    for arm, runs in arms.items():
+        for suffix, header, rows_of in (
+            ("", CURVE_COLUMNS, curve_rows),
+            (".episodes", EPISODE_COLUMNS, episode_rows),
+        ):
+            rows = [row | {"runs": arm} for run in runs for row in rows_of(run)]
+            write_table(folder / f"{arm}{suffix}.csv", (), (*header, "runs"), rows)
+    files.write_text(folder / FILE, text_of({"title": f"Runs: {', '.join(arms)}"}))
+    describe(folder)
+    return folder
 
 
 def thin(rows: Sequence[Row], points: int = MAX_POINTS) -> list[Row]:

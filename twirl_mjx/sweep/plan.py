@@ -16,7 +16,7 @@ from typing import Literal
 
 from twirl_mjx import files, plugins
 from twirl_mjx.policies import rows
-from twirl_mjx.sim.dynamics import SHIFTS
+from twirl_mjx.sim.leaves import SHIFTS
 from twirl_mjx.sim.robots import ROBOTS
 from twirl_mjx.sweep.grid import Draft, Grid, configure
 from twirl_mjx.tasks.registry import TASKS

@@ -18,15 +18,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from twirl_mjx.checks import check_choice, check_range
 from twirl_mjx.sim import frames, kinematics
 from twirl_mjx.sim.dynamics import Dynamics
 from twirl_mjx.sim.robot import FOOT, TRUNK
 from twirl_mjx.sim.scene import BUMP_HALF_SIZE, Scene
 from twirl_mjx.tasks import bands, base, rewards
-from twirl_mjx.tasks.biped import POLISH
-from twirl_mjx.tasks.registry import register
-from twirl_mjx.tasks.task import Link, Measure, Task
+from twirl_mjx.tasks.cards import HurdlesCard, HurdlesOptions
 
 WEIGHTS = {"forward": 0.7, "orientation": 0.05, "joint_calm": 0.15, "hurdle": 0.1}
 """Weights of the reward terms (paper appendix, table of the jumping task)."""
@@ -120,61 +117,8 @@ HURDLES_SUCCESS = 2
 """Hurdles passed that make an episode a success (the paper's courses have two)."""
 
 
-@dataclasses.dataclass(frozen=True)
-class HurdlesOptions:
-    """Task ``hurdles``: jump over randomly spaced hurdles."""
-
-    min_gap: float = 1.6
-    """m, smallest distance between neighbouring hurdles, and to the first."""
-    max_gap: float = 2.6
-    """m, largest distance."""
-    fixed_gap: float = 2.1
-    """m, distance when the course is fixed (dynamics shifts)."""
-    gap: float | None = None
-    """m, distance of all hurdles, on a fixed and on a random course, instead of the above."""
-    hurdle_bonus: Literal["count", "event", "clean"] = "count"
-    """Pay the number of hurdles passed so far at every step, or 1 when one is passed, or the
-    number passed in a single flight so far at every step."""
-
-    def __post_init__(self) -> None:
-        """Check the options (the task has a stricter check of the gaps), or raise ValueError."""
-        check_choice("hurdles.hurdle_bonus", self.hurdle_bonus, ("count", "event", "clean"))
-        for name in ("min_gap", "max_gap", "fixed_gap"):
-            check_range(f"hurdles.{name}", getattr(self, name), 0.0, 1000.0)
-        if self.gap is not None:
-            check_range("hurdles.gap", self.gap, 0.0, 1000.0)
-
-
-@register
-class Hurdles(Task[HurdlesOptions]):
+class Hurdles(HurdlesCard):
     """See the module docstring."""
-
-    name = "hurdles"
-    Options = HurdlesOptions
-    source = "imitate"
-    measures = {
-        "hurdles_passed": Measure("hurdles_passed", "max", 1.0, "1", "hurdles passed"),
-        "clean_clearances": Measure(
-            "clean_clearances", "max", 1.0, "1", "hurdles passed in a single flight phase"
-        ),
-        "hit_hurdle": Measure(
-            "hit_hurdle", "max", 1.0, "share", "ended by touching a hurdle", True
-        ),
-        "fall": Measure(
-            "fall", "max", 1.0, "share", "ended by the trunk touching the ground", True
-        ),
-        "distance_x": Measure("distance_x", "max", 1.0, "m", "way made along x"),
-    }
-    lead = ("hurdles_passed", "single_flight", "return")
-    ratios = {"single_flight": ("clean_clearances", "hurdles_passed")}
-    chain = (
-        Link("imitate", {"task": "imitate"}),
-        Link("hurdles", {"task": "hurdles"}),
-        # Gaps up to a little more than the 3.6 m of the paper's tests: the task has no such.
-        Link("polish", {"task": "hurdles", "hurdles.max_gap": 3.7} | POLISH),
-    )
-    course_options = ("min_gap", "max_gap", "fixed_gap", "gap")
-    caption = ("hurdles_passed",)
 
     def __init__(self, options: HurdlesOptions | None = None, **setting: Any) -> None:
         """Keep the options of the task.

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
-from typing import Literal, cast
+from typing import cast
 
 import flax.struct
 import jax
@@ -23,9 +23,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from twirl_mjx.assets import asset_path
-from twirl_mjx.checks import check_range
 from twirl_mjx.motion.clip import Clip, headings, sample
-from twirl_mjx.motion.formats import AS_IS, Conversion, foot_paths
+from twirl_mjx.motion.conversion import AS_IS, Conversion
+from twirl_mjx.motion.formats import foot_paths
 from twirl_mjx.motion.retarget import read_motion
 from twirl_mjx.sim import frames, kinematics
 from twirl_mjx.sim.dynamics import Dynamics
@@ -33,9 +33,8 @@ from twirl_mjx.sim.robot import CONTROL_DT, HIP, ROOT_SIZE, THIGH, TRUNK, Robot
 from twirl_mjx.sim.robots import A1, ROBOTS
 from twirl_mjx.sim.scene import Scene
 from twirl_mjx.tasks import base, rewards
+from twirl_mjx.tasks.cards import ImitateCard, ImitateOptions
 from twirl_mjx.tasks.observations import HISTORY, Entry, in_history
-from twirl_mjx.tasks.registry import register
-from twirl_mjx.tasks.task import Measure, Task
 
 WEIGHTS = {
     "pose": 0.5,
@@ -106,6 +105,12 @@ def load_clip(
             " need 'wrap'"
         )
     return facing_x(clip)
+
+
+def clip_of(options: ImitateOptions, robot: Robot) -> Clip:
+    """Return the clip that options name; errors of :func:`load_clip`."""
+    other = ROBOTS.get(ROBOTS.admit(options.clip_robot)) if options.clip_robot else None
+    return load_clip(options.clip, robot, options.clip_legs, options.conversion, other)
 
 
 def facing_x(clip: Clip) -> Clip:
@@ -263,75 +268,8 @@ LEAPS_SUCCESS = 3
 """Leaps in a row that make an episode a success."""
 
 
-@dataclasses.dataclass(frozen=True)
-class ImitateOptions:
-    """Task ``imitate``: track a leap clip."""
-
-    clip: str = "leap"
-    """``leap`` (ours) or the path of a clip file (.json, .txt, .npy, .csv)."""
-    clip_legs: tuple[str, ...] = ()
-    """Order of the legs in the file, FL FR RL RR say; what the file says, else FR FL RR RL."""
-    clip_degrees: bool = False
-    """The joint angles of the clip are in degrees."""
-    clip_metres: float = 1.0
-    """m per unit of the clip's root position: 0.01 for centimetres."""
-    clip_quaternion: Literal["xyzw", "wxyz"] = "xyzw"
-    """Order of the clip's quaternions."""
-    clip_root: Literal["a1", "laikago"] = "a1"
-    """Root frame of the clip: x forward and z up, or that of a Laikago."""
-    clip_fps: float = 0.0
-    """Frames per second of the clip, instead of what the file says; 0 to keep that."""
-    clip_robot: str = ""
-    """Robot the clip was recorded on, by name or file.py:NAME, where it is another one: its feet
-    are followed, scaled by the length of the legs."""
-    standing_fraction: float = 0.0
-    """Share of episodes started at rest on four feet, as the episodes of ``hurdles`` are."""
-    max_root_error: float = 1.0
-    """m, an episode ends beyond this distance from the reference root."""
-    max_root_angle: float = 1.5707963
-    """rad, an episode ends beyond this rotation from the reference root."""
-
-    def __post_init__(self) -> None:
-        """Check every number, or raise ValueError."""
-        check_range("imitate.standing_fraction", self.standing_fraction, 0.0, 1.0)
-        check_range("imitate.max_root_error", self.max_root_error, 1e-3, 1e3)
-        check_range("imitate.max_root_angle", self.max_root_angle, 1e-3, 3.1416)
-        _ = self.conversion  # checks itself
-
-    @property
-    def conversion(self) -> Conversion:
-        """What the numbers of the clip are."""
-        return Conversion(
-            self.clip_degrees, self.clip_metres, self.clip_quaternion, self.clip_root, self.clip_fps
-        )
-
-    def load_clip(self, robot: Robot) -> Clip:
-        """Return the clip these options name; errors of :func:`load_clip`."""
-        other = ROBOTS.get(ROBOTS.admit(self.clip_robot)) if self.clip_robot else None
-        return load_clip(self.clip, robot, self.clip_legs, self.conversion, other)
-
-
-@register
-class Imitate(Task[ImitateOptions]):
+class Imitate(ImitateCard):
     """See the module docstring."""
-
-    name = "imitate"
-    Options = ImitateOptions
-    collision = "feet"
-    measures = {
-        "tracking": Measure("tracking", "mean", 1.0, "1", "mean reward over its maximum"),
-        "leaps": Measure("leaps", "max", 1.0, "1", "cycles of the clip survived"),
-        "flights": Measure("flights", "max", 1.0, "1", "cycles with a flight of 4 steps or more"),
-    }
-    presets = {
-        "paper": {"imitate.standing_fraction": 0.2},
-        # Random actions hardly ever track the clip: it starts from planned ones.
-        "cpu": {"variant": "twirl", "source": "clip", "total_env_steps": 1_600_000,
-                "droq.discount": 0.95},
-    }  # fmt: skip
-    course_options = ("standing_fraction",)
-    training_options = ("standing_fraction",)
-    caption = ("tracking",)
 
     def make_observer(self) -> ImitateObserver:
         """Load the clip.
@@ -340,7 +278,7 @@ class Imitate(Task[ImitateOptions]):
             FileNotFoundError: The clip of the options does not exist.
             ValueError: It is not a clip, or does not wrap.
         """
-        return ImitateObserver(self.options.load_clip(self.robot))
+        return ImitateObserver(clip_of(self.options, self.robot))
 
     @property
     def follower(self) -> ImitateObserver:

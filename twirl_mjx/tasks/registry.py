@@ -9,11 +9,11 @@ from typing import Any
 from twirl_mjx.plugins import Registry
 from twirl_mjx.tasks.task import Measure, Task
 
-HOME = "twirl_mjx.tasks."
+BUILT_IN = ("stand", "biped", "imitate", "hurdles")
 
 
 def accept(item: Any) -> type[Task]:
-    """Return a task class after checking what it says of itself.
+    """Return a task class after checking what it says of itself; of a built-in one, its card.
 
     Raises:
         ValueError: It is no task, or a part of it has another form; one line.
@@ -39,7 +39,7 @@ def accept(item: Any) -> type[Task]:
     for key, measure in item.measures.items():
         if not isinstance(measure, Measure):
             raise ValueError(f"{_called(item)}.measures[{key!r}] is no Measure: {measure!r}")
-    return item
+    return item.card()
 
 
 def _called(item: Any) -> str:
@@ -48,9 +48,9 @@ def _called(item: Any) -> str:
 
 TASKS: Registry[type[Task]] = Registry(
     "task",
-    home=tuple(HOME + name for name in ("stand", "biped", "imitate", "hurdles")),
     accept=accept,
     group="twirl_mjx.tasks",
+    shipped={name: f"twirl_mjx.tasks.cards:{name.title()}Card" for name in BUILT_IN},
 )
 """The one list of tasks."""
 

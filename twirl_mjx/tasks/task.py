@@ -3,23 +3,30 @@
 A task is one class in one file. It holds the MDP (``start``, ``judge``, an observer), its options,
 what is measured of an episode and when it is a success, its default source, and what presets,
 courses and films need. Everything that lists tasks, or anything of a task, asks ``registry``.
+
+This module needs neither jax nor MuJoCo, so that options are parsed without them. For the same
+reason a built-in task is two classes: its card (``cards``) and, derived from it, the MDP.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import importlib
 from collections.abc import Mapping
-from typing import Any, ClassVar, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple
 
-import jax
 import numpy as np
 
-from twirl_mjx.sim.dynamics import Dynamics
 from twirl_mjx.sim.robot import Robot
 from twirl_mjx.sim.robots import DEFAULT_ROBOT
-from twirl_mjx.sim.scene import CollisionSet, Scene
-from twirl_mjx.tasks.base import Outcome, Start, View, World
-from twirl_mjx.tasks.observations import Observer, ProprioceptiveObserver
+
+if TYPE_CHECKING:
+    import jax
+
+    from twirl_mjx.sim.dynamics import Dynamics
+    from twirl_mjx.sim.scene import CollisionSet, Scene
+    from twirl_mjx.tasks.base import Outcome, Start, View, World
+    from twirl_mjx.tasks.observations import Observer
 
 How = Literal["sum", "time", "mean", "min", "max"]
 
@@ -83,6 +90,8 @@ class Task[O]:
     """Metrics written into films."""
     shows_goal: ClassVar[bool] = False
     """Whether films show the goal."""
+    mdp: ClassVar[str] = ""
+    """``module:Class`` of the whole task, where this class only says what is known of it."""
 
     observer: Observer
     """What the policy sees."""
@@ -116,6 +125,8 @@ class Task[O]:
 
     def make_observer(self) -> Observer:
         """Return what the policy sees: goal and a 3-step history, unless a task says otherwise."""
+        from twirl_mjx.tasks.observations import ProprioceptiveObserver
+
         return ProprioceptiveObserver(self.robot, axes=False)
 
     def start(self, key: jax.Array, scene: Scene, dynamics: Dynamics) -> Start:
@@ -137,6 +148,20 @@ class Task[O]:
         """Return the world x [H] in m of hurdle bands to draw, given one world's task state."""
         del state
         return np.zeros(0)
+
+    @classmethod
+    def whole(cls) -> type[Task[O]]:
+        """Return the class that can be simulated: that of a card's MDP, else this one."""
+        if "mdp" not in vars(cls):
+            return cls
+        module, _, name = cls.mdp.partition(":")
+        return getattr(importlib.import_module(module), name)
+
+    @classmethod
+    def card(cls) -> type[Task[O]]:
+        """Return the card of a built-in task, else this class."""
+        is_whole = cls.mdp == f"{cls.__module__}:{cls.__qualname__}"
+        return cls.__bases__[0] if is_whole else cls
 
     @classmethod
     def check_options(cls, options: Any) -> None:

@@ -12,7 +12,7 @@ from twirl_mjx.checks import check_choice, check_range
 from twirl_mjx.droq.config import DroqConfig
 from twirl_mjx.replay.config import ReplayConfig
 from twirl_mjx.tasks.registry import TASKS
-from twirl_mjx.training.learners import LEARNERS
+from twirl_mjx.training.learners import DROQ, LEARNERS, settings_of
 from twirl_mjx.worlds.config import WorldConfig, world_fields
 
 Variant = Literal["scratch", "twirl", "twirl+weights", "weights", "zero-shot"]
@@ -74,7 +74,7 @@ class TrainConfig(WorldConfig):
     """Environment transitions to gather."""
     warmup_env_steps: int = 1000
     """Transitions with uniformly random actions before the first update."""
-    learner: str = "droq"
+    learner: str = DROQ
     """Name of the learner, or file.py:NAME of your own."""
     droq: Any = DroqConfig()
     """Settings of the learner, under its own name on the command line."""
@@ -99,7 +99,7 @@ class TrainConfig(WorldConfig):
         self._set("learner", LEARNERS.admit(self.learner))
         if reference := LEARNERS.reference(self.learner):
             self._set("uses", tuple(sorted({*self.uses, reference})))
-        settings = LEARNERS.get(self.learner).Config
+        settings = settings_of(self.learner)
         if type(self.droq) is not settings:
             if self.droq != DroqConfig():
                 raise ValueError(

@@ -15,7 +15,7 @@ from twirl_mjx import records
 from twirl_mjx.checks import check_choice
 from twirl_mjx.tasks.registry import TASKS
 from twirl_mjx.training.config import TrainConfig
-from twirl_mjx.training.learners import LEARNERS
+from twirl_mjx.training.learners import LEARNERS, settings_of
 
 
 def flatten(config: TrainConfig) -> dict[str, Any]:
@@ -93,7 +93,7 @@ def from_dict(record: Any) -> TrainConfig:
     learner = values["learner"] = LEARNERS.admit(learner)
     sections = _sections(task, learner)
     kinds = {name: TASKS.get(name).Options for f, name in sections.items() if f != "droq" and name}
-    kinds[learner] = LEARNERS.get(learner).Config
+    kinds[learner] = settings_of(learner)
     names = [field.name for field in dataclasses.fields(TrainConfig) if field.name not in sections]
     for key in values:
         check_choice("key in config", key, (*names, *kinds))

@@ -21,7 +21,7 @@ from twirl_mjx.tasks.measures import episode_means
 from twirl_mjx.training import program
 from twirl_mjx.training.checkpoint import stored_steps
 from twirl_mjx.training.guards import DivergedError, check_experience, check_finite
-from twirl_mjx.training.learners import check_learner
+from twirl_mjx.training.learner_check import check_learner
 from twirl_mjx.training.logger import RunLogger
 from twirl_mjx.training.metrics import FIRST_DROP
 from twirl_mjx.training.program import Program

@@ -8,16 +8,18 @@ from __future__ import annotations
 import csv
 import dataclasses
 import io
+import re
 import shutil
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any, Literal
 
 from twirl_mjx import files
-from twirl_mjx.checks import choose_one
+from twirl_mjx.checks import check_choice, choose_one
 from twirl_mjx.machine import try_lock
+from twirl_mjx.plugins import is_reference
 
 State = Literal["running", "finished", "stopped", "empty", "damaged"]
 STATES: tuple[State, ...] = ("running", "finished", "stopped", "empty", "damaged")
@@ -63,27 +65,83 @@ class Overview:
         return self.settings.get(name, "?")
 
 
-def find(folder: Path, patterns: Sequence[str] = ()) -> list[Path]:
-    """Return the run directories of a folder whose names match any of the patterns; all by default.
+def known(folder: Path) -> list[Path]:
+    """Return the run directories of a folder, by name."""
+    return sorted(path.parent for path in folder.glob(f"*/{CONFIG}"))
 
-    A pattern may also be the path of a run directory.
+
+def condition(word: str) -> tuple[str, str] | None:
+    """Return setting and value of a word such as ``task:biped``, None where it is no such word."""
+    match = re.fullmatch(r"([a-z][a-z0-9_.]*):([^/]+)", word)
+    if match is None or is_reference(word) or Path(word).exists():
+        return None
+    return match[1], match[2]
+
+
+def find(folder: Path, words: Sequence[str] = ()) -> list[Path]:
+    """Return the run directories that words select; without words all of a folder.
+
+    A word is a name, a shell pattern of names, the path of a run directory, or a condition:
+    ``task:biped``, ``status:finished``, ``droq.utd:0.5``, ``name:*-s0``. All conditions hold.
 
     Raises:
-        FileNotFoundError: A pattern matches nothing; the message names the nearest.
+        FileNotFoundError: A name or pattern matches nothing; the message has the nearest.
+        ValueError: A condition on what no run has; the message has the nearest.
     """
-    known = sorted(path.parent for path in folder.glob(f"*/{CONFIG}"))
-    if not patterns:
-        return known
+    conditions = [pair for word in words if (pair := condition(word))]
     found: dict[Path, None] = {}
-    for pattern in patterns:
-        path = Path(pattern)
-        here = [path] if (path / CONFIG).exists() else []
-        matching = here or [p for p in known if fnmatch(p.name, pattern)]
-        if not matching:
-            choices = choose_one(path.name, [p.name for p in known])
-            raise FileNotFoundError(f"no run {pattern!r} in {folder}: {choices}")
-        found |= dict.fromkeys(matching)
-    return list(found)
+    names = [word for word in words if not condition(word)]
+    for name in names:
+        path = Path(name)
+        here = [path] if (path / CONFIG).exists() else _matching(folder, name)
+        if not here:
+            choices = choose_one(path.name, [p.name for p in known(folder)])
+            raise FileNotFoundError(f"no run {name!r} in {folder}: {choices}")
+        found |= dict.fromkeys(here)
+    chosen = list(found) if names else known(folder)
+    facts = {path: _facts(path) for path in chosen} if conditions else {}
+    asked = tuple(dict.fromkeys(key for fact in facts.values() for key in fact))
+    for key, value in conditions if chosen else ():
+        check_choice("condition on runs", key, asked)
+        chosen = [path for path in chosen if fnmatch(str(facts[path].get(key)), value)]
+    return chosen
+
+
+def _matching(folder: Path, pattern: str) -> list[Path]:
+    return [p for p in known(folder) if fnmatch(p.name, pattern) or fnmatch(str(p), pattern)]
+
+
+def _facts(path: Path) -> dict[str, Any]:
+    """Return what conditions may ask of a run."""
+    settings = _settings(path / CONFIG)
+    return {"name": path.name, "status": _state(path, settings)} | settings
+
+
+def expand(words: Sequence[str], folder: Path, but: Collection[str] = ()) -> list[str]:
+    """Return policies to load: words that select runs give way to the paths of these.
+
+    Args:
+        words: Names, patterns and conditions as in :func:`find`; whatever else there is stays.
+        folder: Of all runs.
+        but: Names of something else.
+
+    Raises:
+        FileNotFoundError: Conditions, and no run that fits.
+        ValueError: A condition on what no run has.
+    """
+    conditions = [word for word in words if condition(word)]
+    names = [
+        word
+        for word in words
+        if word not in (*conditions, *but) and not Path(word).exists() and _matching(folder, word)
+    ]
+    selected = list(map(str, find(folder, [*names, *conditions]))) if names or conditions else []
+    if conditions and not selected:
+        raise FileNotFoundError(f"no run in {folder} fits {' '.join([*names, *conditions])}")
+    out: list[str] = []
+    for word in words:
+        out += selected if word in (*names, *conditions) else [word]
+    return list(dict.fromkeys(out))
 
 
 def look(path: Path) -> Overview:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from twirl_mjx import machine
 from twirl_mjx.checks import check_choice
 from twirl_mjx.tasks.registry import TASKS
 from twirl_mjx.training.config import TrainConfig
@@ -64,6 +65,8 @@ PRESETS = tuple(SETTINGS)
 
 def default_preset() -> str:
     """Return ``paper`` where jax has an accelerator, else ``cpu``."""
+    if not machine.may_have_accelerator():
+        return "cpu"
     import jax
 
     return "cpu" if jax.default_backend() == "cpu" else "paper"

@@ -21,10 +21,15 @@ def live_page(title: str) -> str:
     return _page(title, "null")
 
 
-def _page(title: str, replay: str) -> str:
+def web_page(title: str) -> str:
+    """Return the page whose loop runs in the browser; its other files are those of ``web``."""
+    return _page(title, '"inside"', before=_asset("web.js"))
+
+
+def _page(title: str, replay: str, before: str = "") -> str:
     """Fill the page's template; scripts may hold anything but the end of a script."""
     text = files.read_text(asset_path("view", "page.html"), "the page")
-    parts = {name: _asset(f"{name}.js") for name in ("scene", "page")}
+    parts = {"scene": _asset("scene.js"), "page": before + _asset("page.js")}
     text = text.replace("@TITLE@", html.escape(title)).replace("@MARK@", files.MARK)
     for name, content in (parts | {"replay": replay}).items():
         text = text.replace(f"@{name.upper()}@", content)

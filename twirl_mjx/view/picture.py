@@ -32,9 +32,10 @@ class Picture:
             (model.geom_group < FIRST_HIDDEN_GROUP) & np.isin(model.geom_type, list(_KINDS))
         )
         robot = {int(model.jnt_bodyid[0])} | set(map(int, model.geom_bodyid[geoms]))
-        self._bodies = [0, *sorted(robot - {0})]
+        self.bodies = [0, *sorted(robot - {0})]
+        """Ids of the bodies in the order of poses."""
         self.scene: dict[str, Any] = {
-            "bodies": len(self._bodies),
+            "bodies": len(self.bodies),
             "geoms": [self._geom(int(i)) for i in geoms],
         }
         """JSON-ready: how many bodies, and every geom with its type, size, colour and pose in its
@@ -44,7 +45,7 @@ class Picture:
         model = self._model
         kind, colour = _KINDS[int(model.geom_type[i])], _colour(model, i)
         geom: dict[str, Any] = {
-            "body": self._bodies.index(int(model.geom_bodyid[i])),
+            "body": self.bodies.index(int(model.geom_bodyid[i])),
             "type": kind,
             "size": model.geom_size[i].round(5).tolist(),
             "colour": colour.round(3).tolist(),
@@ -60,7 +61,7 @@ class Picture:
         """Return position and quaternion wxyz [7 B] float32 of every body at ``qpos``, world."""
         self._data.qpos[:] = qpos
         mujoco.mj_kinematics(self._model, self._data)
-        places = [self._data.xpos[self._bodies], self._data.xquat[self._bodies]]
+        places = [self._data.xpos[self.bodies], self._data.xquat[self.bodies]]
         return np.concatenate(places, axis=1).astype(np.float32).ravel()
 
 

@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
 from twirl_mjx.checks import check_choice, check_range
-from twirl_mjx.sim.dynamics import LEAVES, SHIFTS, Dynamics, leaf_values, make_dynamics
+from twirl_mjx.sim.leaves import LEAVES, SHIFTS, leaf_values
 from twirl_mjx.sim.ranges import Ranges, parse_ranges
 from twirl_mjx.sim.robots import DEFAULT_ROBOT, ROBOTS
 from twirl_mjx.tasks.registry import TASKS
 from twirl_mjx.tasks.task import Task
+
+if TYPE_CHECKING:
+    from twirl_mjx.sim.dynamics import Dynamics
 
 REGISTRIES = (TASKS, SHIFTS, ROBOTS)
 """What a config may name that can come from a user's own file."""
@@ -110,7 +113,7 @@ class WorldConfig:
 
     @property
     def task_type(self) -> type[Task]:
-        """The class of the task."""
+        """The class of the task, of a built-in one its card."""
         return TASKS.get(self.task)
 
     @property
@@ -132,6 +135,8 @@ class WorldConfig:
         Raises:
             ValueError: An unknown name, or a value that is out of range or without effect.
         """
+        from twirl_mjx.sim.dynamics import make_dynamics  # needs jax, which options do not
+
         return make_dynamics(
             self.shift if shift is None else shift,
             self.shift_strength if strength is None else strength,
@@ -152,7 +157,7 @@ class WorldConfig:
             ValueError: Options that do not fit one another.
             FileNotFoundError: A file that they name does not exist.
         """
-        return self.task_type(
+        return self.task_type.whole()(
             self.options,
             robot=ROBOTS.get(self.robot),
             fixed_course=self.fixed_course,

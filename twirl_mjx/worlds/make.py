@@ -9,8 +9,8 @@ from typing import Any
 
 from twirl_mjx import records
 from twirl_mjx.cache import use_cache
-from twirl_mjx.sim.dynamics import SceneKind, get_shift
 from twirl_mjx.sim.engine import make_engine
+from twirl_mjx.sim.leaves import SceneKind, get_shift
 from twirl_mjx.sim.scene import SimOptions, build_scene
 from twirl_mjx.tasks.registry import TASKS
 from twirl_mjx.tasks.task import Task

@@ -16,9 +16,9 @@ import numpy as np
 
 from twirl_mjx.checks import check_range
 from twirl_mjx.sim import actuation, mjx
-from twirl_mjx.sim.dynamics import Dynamics, broadcast, leaf_value
+from twirl_mjx.sim.dynamics import Dynamics, broadcast, draw, leaf_value
 from twirl_mjx.sim.engine import Engine, Trace, make_data, world_model
-from twirl_mjx.sim.ranges import NO_RANGES, Ranges, draw
+from twirl_mjx.sim.ranges import NO_RANGES, Ranges
 from twirl_mjx.sim.scene import Scene
 from twirl_mjx.tasks.base import Outcome, World, make_view
 from twirl_mjx.tasks.observations import layout_noise, layout_size

@@ -17,7 +17,7 @@ def _accept(item: Any) -> Robot:
     return item
 
 
-ROBOTS: Registry[Robot] = Registry("robot", home=(), accept=_accept, group="twirl_mjx.robots")
+ROBOTS: Registry[Robot] = Registry("robot", accept=_accept, group="twirl_mjx.robots")
 """The one list of robots."""
 
 register_robot = ROBOTS.register
