@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 import tyro
@@ -15,6 +15,7 @@ from twirl_mjx.assets import asset_path
 from twirl_mjx.checks import check_choice
 from twirl_mjx.commands.console import parse, say
 from twirl_mjx.commands.render import stem_of
+from twirl_mjx.motion.conversion import ClipOptions
 from twirl_mjx.motion.leap_config import LeapConfig
 
 if TYPE_CHECKING:
@@ -39,27 +40,13 @@ class MakeOptions:
 
 
 @dataclasses.dataclass(frozen=True)
-class CheckOptions:
+class CheckOptions(ClipOptions):
     """Check whether clips can be motions of a robot, and say of each what it holds."""
 
     clips: Annotated[tuple[Path, ...], tyro.conf.Positional] = ()
     """Clip files (.json, .txt, .npy, .csv); the shipped leap by default."""
     robot: str = "a1"
     """Robot that shall move so, by name or file.py:NAME."""
-    clip_robot: str = ""
-    """Robot the clips were recorded on, where it is another one: its feet are followed."""
-    clip_legs: tuple[str, ...] = ()
-    """Order of the legs in the files, FL FR RR RL say; what they say, else FR FL RR RL."""
-    clip_degrees: bool = False
-    """Joint angles are in degrees."""
-    clip_metres: float = 1.0
-    """m per unit of the root position: 0.01 for centimetres."""
-    clip_quaternion: Literal["xyzw", "wxyz"] = "xyzw"
-    """Order of quaternions."""
-    clip_root: Literal["a1", "laikago"] = "a1"
-    """Root frame: x forward and z up, or that of a Laikago."""
-    clip_fps: float = 0.0
-    """Frames per second, instead of what the files say; 0 to keep that."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -106,19 +93,16 @@ def _check(argv: list[str], set_up: Callable[[bool], None]) -> int:
 
 def _read_all(options: CheckOptions) -> list[Clip]:
     """Return the clips as motions of the robot; the first that cannot be one is refused."""
-    from twirl_mjx.motion.conversion import Conversion
     from twirl_mjx.motion.retarget import read_motion
     from twirl_mjx.sim.robots import ROBOTS
 
     robot = ROBOTS.get(ROBOTS.admit(options.robot))
     other = ROBOTS.get(ROBOTS.admit(options.clip_robot)) if options.clip_robot else None
-    conversion = Conversion(
-        options.clip_degrees, options.clip_metres, options.clip_quaternion, options.clip_root,
-        options.clip_fps,
-    )  # fmt: skip
     paths = options.clips or (asset_path("a1", "leap.json"),)
     try:
-        return [read_motion(path, robot, options.clip_legs, conversion, other) for path in paths]
+        return [
+            read_motion(path, robot, options.clip_legs, options.conversion, other) for path in paths
+        ]
     except ValueError as error:  # the gates name the options of the task
         raise ValueError(str(error).replace("--imitate.clip-", "--clip-")) from error
 

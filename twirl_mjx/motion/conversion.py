@@ -56,3 +56,35 @@ class Conversion:
 
 
 AS_IS = Conversion()
+
+
+@dataclasses.dataclass(frozen=True)
+class ClipOptions:
+    """How a clip file is read, as options of a task or a command."""
+
+    clip_legs: tuple[str, ...] = ()
+    """Order of the legs in the file, FL FR RL RR say; what the file says, else FR FL RR RL."""
+    clip_degrees: bool = False
+    """The joint angles of the clip are in degrees."""
+    clip_metres: float = 1.0
+    """m per unit of the clip's root position: 0.01 for centimetres."""
+    clip_quaternion: Literal["xyzw", "wxyz"] = "xyzw"
+    """Order of the clip's quaternions."""
+    clip_root: Literal["a1", "laikago"] = "a1"
+    """Root frame of the clip: x forward and z up, or that of a Laikago."""
+    clip_fps: float = 0.0
+    """Frames per second of the clip, instead of what the file says; 0 to keep that."""
+    clip_robot: str = ""
+    """Robot the clip was recorded on, by name or file.py:NAME, where it is another one: its feet
+    are followed, scaled by the length of the legs."""
+
+    def __post_init__(self) -> None:
+        """Check every value, or raise ValueError."""
+        _ = self.conversion  # checks itself
+
+    @property
+    def conversion(self) -> Conversion:
+        """What the numbers of the clip are."""
+        return Conversion(
+            self.clip_degrees, self.clip_metres, self.clip_quaternion, self.clip_root, self.clip_fps
+        )

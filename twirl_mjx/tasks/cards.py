@@ -11,7 +11,7 @@ import dataclasses
 from typing import ClassVar, Literal
 
 from twirl_mjx.checks import check_choice, check_range
-from twirl_mjx.motion.conversion import Conversion
+from twirl_mjx.motion.conversion import ClipOptions
 from twirl_mjx.tasks.task import Link, Measure, Task
 
 
@@ -161,26 +161,11 @@ class BipedCard(Task[BipedOptions]):
 
 
 @dataclasses.dataclass(frozen=True)
-class ImitateOptions:
+class ImitateOptions(ClipOptions):
     """Task ``imitate``: track a leap clip."""
 
     clip: str = "leap"
     """``leap`` (ours) or the path of a clip file (.json, .txt, .npy, .csv)."""
-    clip_legs: tuple[str, ...] = ()
-    """Order of the legs in the file, FL FR RL RR say; what the file says, else FR FL RR RL."""
-    clip_degrees: bool = False
-    """The joint angles of the clip are in degrees."""
-    clip_metres: float = 1.0
-    """m per unit of the clip's root position: 0.01 for centimetres."""
-    clip_quaternion: Literal["xyzw", "wxyz"] = "xyzw"
-    """Order of the clip's quaternions."""
-    clip_root: Literal["a1", "laikago"] = "a1"
-    """Root frame of the clip: x forward and z up, or that of a Laikago."""
-    clip_fps: float = 0.0
-    """Frames per second of the clip, instead of what the file says; 0 to keep that."""
-    clip_robot: str = ""
-    """Robot the clip was recorded on, by name or file.py:NAME, where it is another one: its feet
-    are followed, scaled by the length of the legs."""
     standing_fraction: float = 0.0
     """Share of episodes started at rest on four feet, as the episodes of ``hurdles`` are."""
     max_root_error: float = 1.0
@@ -190,17 +175,10 @@ class ImitateOptions:
 
     def __post_init__(self) -> None:
         """Check every number, or raise ValueError."""
+        super().__post_init__()
         check_range("imitate.standing_fraction", self.standing_fraction, 0.0, 1.0)
         check_range("imitate.max_root_error", self.max_root_error, 1e-3, 1e3)
         check_range("imitate.max_root_angle", self.max_root_angle, 1e-3, 3.1416)
-        _ = self.conversion  # checks itself
-
-    @property
-    def conversion(self) -> Conversion:
-        """What the numbers of the clip are."""
-        return Conversion(
-            self.clip_degrees, self.clip_metres, self.clip_quaternion, self.clip_root, self.clip_fps
-        )
 
 
 class ImitateCard(Task[ImitateOptions]):
