@@ -11,6 +11,7 @@ import json
 import re
 import shutil
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -19,8 +20,10 @@ import pytest
 
 import twirl_mjx
 from twirl_mjx import cli, plugins
+from twirl_mjx.commands import evaluate, options, render
 from twirl_mjx.commands.options import parse_train
 from twirl_mjx.sim.leaves import SHIFTS
+from twirl_mjx.sim.robots import ROBOTS
 from twirl_mjx.sweep import plan
 from twirl_mjx.sweep.grid import load
 from twirl_mjx.tasks.registry import TASKS
@@ -35,7 +38,7 @@ ROOT = Path(__file__).parents[1]
 @pytest.fixture(autouse=True)
 def _forget(monkeypatch: pytest.MonkeyPatch) -> None:
     """What a test registers is gone after it."""
-    for registry in (TASKS, SHIFTS):
+    for registry in (TASKS, SHIFTS, ROBOTS):
         registry.names()
         monkeypatch.setattr(registry, "_items", dict(registry._items))
         monkeypatch.setattr(registry, "_references", dict(registry._references))
@@ -315,3 +318,21 @@ def test_names_of_tasks_and_of_the_robot_stand_in_few_files() -> None:
 
 def test_measures_have_defaults() -> None:
     assert Measure("speed", "mean", unit="m/s") == Measure("speed", "mean", 1.0, "m/s", "", False)
+
+
+@pytest.mark.parametrize("kind", [evaluate.EvaluateOptions, render.RenderOptions])
+def test_a_policy_is_shown_on_another_robot(kind: Any, tmp_path: Path) -> None:
+    path = tmp_path / "r.py"
+    path.write_text(
+        "import dataclasses\nfrom twirl_mjx.sim.robots import A1\n"
+        "TALL = dataclasses.replace(A1, name='tall')\n"
+    )
+    positional = ["zero", "--task", "stand"]
+    _, overrides = options.parse_in_tasks(kind, [*positional, "--robot", f"{path}:TALL"], "x")
+    config = options.with_overrides(WorldConfig(task="stand"), overrides)
+    assert config.make_task().robot.name == "tall"
+    _, none = options.parse_in_tasks(kind, positional, "x")
+    assert options.with_overrides(WorldConfig(task="stand"), none).robot == "a1"
+    _, wrong = options.parse_in_tasks(kind, [*positional, "--robot", "a2"], "x")
+    with pytest.raises(ValueError, match="unknown robot 'a2'.*nearest: 'a1'"):
+        options.with_overrides(WorldConfig(task="stand"), wrong)

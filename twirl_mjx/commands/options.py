@@ -135,7 +135,8 @@ Overrides = dict[str, dict[str, Any]]
 def parse_in_tasks[T](kind: type[T], argv: list[str], prog: str) -> tuple[T, Overrides]:
     """Parse a command that also takes options of tasks and worlds.
 
-    Such as ``--biped.goal-distance 1``, ``--dynamics.friction 0.3``, ``--randomize payload=0:2``.
+    Such as ``--biped.goal-distance 1``, ``--dynamics.friction 0.3``, ``--randomize payload=0:2``,
+    ``--robot go1.py:GO1``.
 
     Returns:
         The command's own options, and those others that were given.
@@ -154,6 +155,8 @@ def parse_in_tasks[T](kind: type[T], argv: list[str], prog: str) -> tuple[T, Ove
         ("dynamics", DynamicsOverrides, dataclasses.field(default=NO_OVERRIDES)),
         ("randomize", Annotated[tuple[str, ...], _RANDOMIZE], dataclasses.field(default=())),
     ]
+    if picks_robot := "robot" not in _field_names(kind):
+        fields.append(("robot", Annotated[str, _ROBOT], dataclasses.field(default="")))
     for name in tasks:
         some = _all_optional(TASKS.get(name).Options)
         fields.append((name, some, dataclasses.field(default=some())))
@@ -166,12 +169,17 @@ def parse_in_tasks[T](kind: type[T], argv: list[str], prog: str) -> tuple[T, Ove
         name: {k: v for k, v in vars(getattr(found, name)).items() if v is not None}
         for name in ("dynamics", *tasks)
     }
-    given["worlds"] = {"randomize": found.randomize} if found.randomize else {}
+    worlds = {"randomize": found.randomize, "robot": found.robot if picks_robot else ""}
+    given["worlds"] = {name: value for name, value in worlds.items() if value}
     return own, {name: values for name, values in given.items() if values}
 
 
 _RANDOMIZE = tyro.conf.arg(
     help="Physical parameters drawn for every episode: leaf=low:high, friction=0.4:1.25."
+)
+
+_ROBOT = tyro.conf.arg(
+    help="Robot to act with, by name or file.py:NAME; that of the policy by default."
 )
 
 
