@@ -62,6 +62,15 @@ def test_a_shift_given_twice_is_refused(capsys: pytest.CaptureFixture[str]) -> N
     assert "names one twice (nearest: --shifts icy none)" in capsys.readouterr().err
 
 
+def test_a_link_that_cannot_adapt_is_refused_before_the_first(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = ["--runs", str(tmp_path)]
+    assert cli.main(["curriculum", "--task", "stand", "--preset", "debug", *folder]) == 2
+    assert "variant scratch uses no source" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
 @pytest.mark.slow
 def test_a_chain_runs_and_is_not_repeated(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]

@@ -334,5 +334,5 @@ def test_a_policy_is_shown_on_another_robot(kind: Any, tmp_path: Path) -> None:
     _, none = options.parse_in_tasks(kind, positional, "x")
     assert options.with_overrides(WorldConfig(task="stand"), none).robot == "a1"
     _, wrong = options.parse_in_tasks(kind, [*positional, "--robot", "a2"], "x")
-    with pytest.raises(ValueError, match="unknown robot 'a2'.*nearest: 'a1'"):
+    with pytest.raises(ValueError, match=r"unknown robot 'a2'.*nearest: 'a1'"):
         options.with_overrides(WorldConfig(task="stand"), wrong)

@@ -116,9 +116,11 @@ def main(argv: list[str]) -> int:
     check_choice("preset", preset, PRESETS)
     options = dataclasses.replace(options, shifts=tuple(map(SHIFTS.admit, options.shifts)))
     check_once("--shifts", options.shifts)
-    from twirl_mjx.training import pipeline
+    from twirl_mjx.training import pipeline, source_rules
 
     links = plan(options, preset)
+    for _, config in links:  # the last link would be refused after hours of those before it
+        source_rules.check_source_is_used(config, preset)
     for number, (name, config) in enumerate(links, 1):
         say(f"link {number} of {len(links)}: {name}")
         pipeline.run(config, preset, options.runs, name, say)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -32,18 +33,25 @@ COMMANDS: dict[str, tuple[list[str], list[str]]] = {
     "train": (["--task", "biped", "--source", "zero", "--name", "a", *SMALL], ["runs/a/eval.csv"]),
     "collect": (["--task", "biped", "--source", "zero", "--name", "a", *SMALL],
                 ["runs/a/source.npz"]),
-    "curriculum": (["--task", "stand", "--shifts", "icy", *SMALL],
-                   ["runs/stand-icy-chain-debug-s0/eval.csv"]),
+    "curriculum": (["--task", "biped", "--source", "zero", "--shifts", "icy", *SMALL],
+                   ["runs/biped-icy-chain-debug-s0/eval.csv"]),
     "evaluate": (["zero", "--task", "stand", "--episodes", "2", "--shifts", "none", "--out",
                   "out.csv"], ["out.csv"]),
     "export": (["stand.npz", "--out", "out.onnx"], ["out.onnx", "contract.json"]),
-    "report": (["--results", str(ROOT / "experiments" / "results"), "--out", "out.html"],
-               ["out.html"]),
+    "report": (["--results", "tables", "--out", "out.html"], ["out.html"]),
     "sweep": (["grid.py", "--workers", "1", "--runs", "runs", "--results", "results"],
               ["results/grid/biped.csv"]),
 }  # fmt: skip
 """Command, its words, and what it writes in the end."""
 CLOCK = ("wall_s", "command", "took")
+
+
+def prepare(folder: Path) -> None:
+    """Put there what the commands read."""
+    folder.mkdir()
+    (folder / "grid.py").write_text(GRID)
+    shutil.copy(asset_path("policies", "stand.npz"), folder)
+    shutil.copytree(ROOT / "experiments" / "results" / "trot", folder / "tables" / "trot")
 
 
 def start(name: str, folder: Path) -> subprocess.Popen[str]:
@@ -56,9 +64,6 @@ def start(name: str, folder: Path) -> subprocess.Popen[str]:
 
 def whole(name: str, folder: Path) -> float:
     """Run a command to its end; return how long it took, s."""
-    folder.mkdir(exist_ok=True)
-    (folder / "grid.py").write_text(GRID)
-    (folder / "stand.npz").write_bytes(asset_path("policies", "stand.npz").read_bytes())
     began, process = time.monotonic(), start(name, folder)
     _, err = process.communicate(timeout=900)
     assert process.returncode == 0, err
@@ -96,12 +101,11 @@ def faults_of(name: str, number: int, process: Any, err: str, folder: Path) -> l
 @pytest.mark.parametrize("name", COMMANDS)
 def test_a_command_outlives_signals(name: str, tally: Any, tmp_path: Path) -> None:
     """Whole runs before and after are equal; between, no traceback, no hang, nothing half."""
+    folder = tmp_path / "part"
+    for place in (tmp_path / "whole", folder):
+        prepare(place)
     seconds = whole(name, tmp_path / "whole")
     expected = content(name, tmp_path / "whole")
-    folder = tmp_path / "part"
-    folder.mkdir()
-    for file in ("grid.py", "stand.npz"):
-        (folder / file).write_bytes((tmp_path / "whole" / file).read_bytes())
     kind = f"SIGKILL, SIGTERM, SIGINT of `twirl {name}`"
     for number, moment in zip(SIGNALS, MOMENTS, strict=True):
         process = start(name, folder)
