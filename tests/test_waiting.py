@@ -37,21 +37,6 @@ def test_short_waits_and_pipes_show_nothing(monkeypatch: pytest.MonkeyPatch) -> 
         assert screen.getvalue() == ""
 
 
-def test_options_are_parsed_without_what_only_runs_need() -> None:
-    """MJX, orbax, scipy and Ray take seconds to import; mujoco.mjx also prints."""
-    code = """
-import sys
-from twirl_mjx import cli
-for name in ("train", "collect", "evaluate"):
-    cli._import_command(name)
-import twirl_mjx.commands.options
-heavy = {"mujoco.mjx", "orbax.checkpoint", "scipy.spatial", "ray", "matplotlib"}
-assert not heavy & set(sys.modules), sorted(heavy & set(sys.modules))
-assert "jax" in sys.modules  # else this test would look at nothing
-"""
-    subprocess.run([sys.executable, "-c", code], timeout=250, check=True)
-
-
 def test_mjx_is_imported_quietly_even_while_jax_traces() -> None:
     code = """
 import jax

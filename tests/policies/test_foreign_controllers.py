@@ -44,6 +44,7 @@ def test_the_joystick_trot_becomes_source_data(
     assert set(apart.argmin(axis=1)) == set(range(8))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("task", ["biped", "hurdles"])
 def test_the_joystick_obeys(task: str, graphs: SimpleNamespace, tmp_path: Path) -> None:
     """In C MuJoCo: forward as fast as told, turning as told, standing when told to."""

@@ -223,6 +223,7 @@ def test_a_seed_that_diverges_stops_alone(
     assert (tmp_path / "b-s5" / "eval.csv").is_file()
 
 
+@pytest.mark.slow
 def test_when_all_diverge_the_batch_ends(stand_config: TrainConfig, tmp_path: Path) -> None:
     def broken(learner: Any) -> Any:
         return learner.replace(log_temperature=jnp.float32(jnp.nan))

@@ -87,6 +87,7 @@ def test_experience_before_learning_agrees(batch_stages: Stages, single_stages: 
     jax.tree.map(same, seeds.seed_state(batch, 1), single)
 
 
+@pytest.mark.slow
 def test_learning_agrees_to_float32_rounding(batch_stages: Stages, single_stages: Stages) -> None:
     """After 64 updates weights were seen to differ by 3e-8, joint speeds by 4e-6 rad/s."""
     batch, single = seeds.seed_state(batch_stages[3][0], 1), single_stages[3][0]

@@ -13,7 +13,7 @@ from __future__ import annotations
 import dataclasses
 import importlib
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, Self
 
 import numpy as np
 
@@ -95,6 +95,11 @@ class Task[O]:
 
     observer: Observer
     """What the policy sees."""
+
+    def __new__(cls, *args: Any, **settings: Any) -> Self:
+        """Return an object of the whole task, also where a card is asked for one."""
+        del args, settings
+        return super().__new__(cls.whole())  # type: ignore[return-value]
 
     def __init__(
         self,

@@ -36,7 +36,7 @@ def check_weights_fit(config: TrainConfig, preset: str) -> None:
     match source_of(config, preset):
         case AtPath(is_shipped=True) | RunOf():
             task = source_task_of(config)
-            layout = TASKS.get(task).whole()(config.source_options).observer.layout
+            layout = TASKS.get(task)(config.source_options).observer.layout
             check_layouts(config, task, layout, f"the source task {task}")
 
 

@@ -157,7 +157,7 @@ class WorldConfig:
             ValueError: Options that do not fit one another.
             FileNotFoundError: A file that they name does not exist.
         """
-        return self.task_type.whole()(
+        return self.task_type(
             self.options,
             robot=ROBOTS.get(self.robot),
             fixed_course=self.fixed_course,
