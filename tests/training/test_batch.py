@@ -240,6 +240,7 @@ def test_when_all_diverge_the_batch_ends(stand_config: TrainConfig, tmp_path: Pa
         loop.train(parts)
 
 
+@pytest.mark.slow
 def test_time_that_is_over_stops_and_saves(
     stand_config: TrainConfig, template: TrainState, tmp_path: Path
 ) -> None:

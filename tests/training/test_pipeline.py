@@ -75,7 +75,7 @@ def test_collected_data_are_used_again_until_settings_change(
     [
         pytest.param("weights", marks=pytest.mark.slow),
         pytest.param("twirl+weights", marks=pytest.mark.slow),
-        "twirl",
+        pytest.param("twirl", marks=pytest.mark.slow),
         "zero-shot",
     ],
 )

@@ -104,6 +104,7 @@ def test_learning_agrees_to_float32_rounding(batch_stages: Stages, single_stages
     jax.tree.map(functools.partial(np.testing.assert_allclose, rtol=1e-4, atol=1e-4), batch, single)
 
 
+@pytest.mark.slow
 def test_metrics_are_those_of_every_seed(batch_stages: Stages, single_stages: Stages) -> None:
     metrics, alone = batch_stages[3][1], single_stages[3][1]
     assert set(metrics) == set(alone)
