@@ -13,7 +13,9 @@ from twirl_mjx import records
 from twirl_mjx.droq.config import DroqConfig
 from twirl_mjx.policies.resolve import SCRIPTED_SOURCES
 from twirl_mjx.replay.config import ReplayConfig
-from twirl_mjx.tasks.cards import BipedOptions, HurdlesOptions, ImitateOptions
+from twirl_mjx.tasks.biped import BipedOptions
+from twirl_mjx.tasks.hurdles import HurdlesOptions
+from twirl_mjx.tasks.imitate import ImitateOptions
 from twirl_mjx.tasks.registry import TASKS
 from twirl_mjx.training import config_json
 from twirl_mjx.training.config import EvalConfig, TrainConfig

@@ -23,8 +23,7 @@ from twirl_mjx.sim.dynamics import make_dynamics
 from twirl_mjx.sim.robots import A1
 from twirl_mjx.sim.scene import build_scene
 from twirl_mjx.tasks import base
-from twirl_mjx.tasks.cards import ImitateOptions
-from twirl_mjx.tasks.imitate import Imitate, ImitateState, clip_of
+from twirl_mjx.tasks.imitate import Imitate, ImitateOptions, ImitateState, clip_of
 
 STEPS = 30
 """Control steps of a test; a cycle of the leap has 25."""
@@ -76,7 +75,7 @@ def test_the_observation_is_the_simulation_s_and_the_contract_s(
     @jax.jit
     def contracted(memory: Any, *seen: jax.Array) -> Any:
         obs, after, history = policy.observe(memory, state(*seen))
-        return obs[0], memory.replace(history=history, offset=after.offset)
+        return obs[0], memory._replace(history=history, offset=after.offset)
 
     push, observe = jax.jit(observer.push), jax.jit(observer.observe)
     memory = other = None

@@ -16,8 +16,7 @@ from twirl_mjx.motion.plausible import check_plausible
 from twirl_mjx.motion.retarget import lowest_feet, read_motion, retarget, thigh_joints
 from twirl_mjx.sim.robot import Robot
 from twirl_mjx.sim.robots import A1
-from twirl_mjx.tasks.cards import ImitateOptions
-from twirl_mjx.tasks.imitate import clip_of, load_clip
+from twirl_mjx.tasks.imitate import ImitateOptions, clip_of, load_clip
 
 BIG = dataclasses.replace(
     A1, name="big", thigh_length=0.25, calf_length=0.25, thigh_offset=1.25 * A1.thigh_offset,

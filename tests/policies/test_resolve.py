@@ -17,7 +17,8 @@ from twirl_mjx.motion.formats import read_clip, write_clip
 from twirl_mjx.policies.learned import PolicyFileError, PolicyHeader, load_policy, save_policy
 from twirl_mjx.policies.resolve import config_of_card, config_of_source, resolve_policy
 from twirl_mjx.policies.source import ObservingSource, OwnTaskSource
-from twirl_mjx.tasks.cards import ImitateOptions, StandOptions
+from twirl_mjx.tasks.imitate import ImitateOptions
+from twirl_mjx.tasks.stand import StandOptions
 from twirl_mjx.training.presets import make_config
 
 

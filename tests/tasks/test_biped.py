@@ -13,9 +13,8 @@ from scipy.spatial.transform import Rotation
 
 from twirl_mjx.sim.robots import A1
 from twirl_mjx.tasks.base import Outcome
-from twirl_mjx.tasks.biped import Biped
-from twirl_mjx.tasks.cards import BipedOptions, GoalOptions
-from twirl_mjx.tasks.goals import draw_goal
+from twirl_mjx.tasks.biped import Biped, BipedOptions
+from twirl_mjx.tasks.goals import GoalOptions, draw_goal
 from twirl_mjx.worlds.config import WorldConfig
 
 

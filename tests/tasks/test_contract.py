@@ -13,8 +13,8 @@ import pytest
 import twirl_mjx
 from twirl_mjx.sim.dynamics import make_dynamics
 from twirl_mjx.sim.leaves import PAPER_SHIFTS
-from twirl_mjx.tasks.cards import StandOptions
 from twirl_mjx.tasks.registry import TASKS
+from twirl_mjx.tasks.stand import StandOptions
 from twirl_mjx.worlds.config import WorldConfig
 from twirl_mjx.worlds.make import make
 from twirl_mjx.worlds.vector import EnvState

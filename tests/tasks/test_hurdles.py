@@ -14,8 +14,7 @@ from twirl_mjx.sim.dynamics import make_dynamics
 from twirl_mjx.sim.robots import A1
 from twirl_mjx.sim.scene import build_scene, terrain_height
 from twirl_mjx.tasks import base, rewards
-from twirl_mjx.tasks.cards import HurdlesOptions
-from twirl_mjx.tasks.hurdles import WEIGHTS, Hurdles, HurdlesState, advance, watch
+from twirl_mjx.tasks.hurdles import WEIGHTS, Hurdles, HurdlesOptions, HurdlesState, advance, watch
 from twirl_mjx.tasks.observations import layout_size, layout_slices
 
 FLAT = build_scene("flat")
@@ -218,9 +217,9 @@ def test_a_clean_clearance_is_one_flight(take_off_at: float, land_at: float, cle
 def test_a_hurdle_is_cleared_only_when_passed_and_behind() -> None:
     crossing = WATCH(jnp.asarray(flying(np.full(SUBSTEPS, 2.35)), jnp.float32))
     assert not advance(task_state(), crossing, jnp.float32(2.35)).cleared.any()
-    behind = crossing.replace(last_foot=jnp.float32(2.05))
+    behind = crossing._replace(last_foot=jnp.float32(2.05))
     assert not advance(task_state(), behind, jnp.float32(2.45)).cleared.any()
-    past = crossing.replace(last_foot=jnp.float32(2.15))
+    past = crossing._replace(last_foot=jnp.float32(2.15))
     assert advance(task_state(), past, jnp.float32(2.45)).cleared.tolist() == [True, False, False]
 
 

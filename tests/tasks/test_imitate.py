@@ -121,7 +121,7 @@ def test_a_perfect_tracker_scores_one(harness: Harness) -> None:
         assert all(float(out.metrics[name]) == pytest.approx(1.0, abs=2e-6) for name in WEIGHTS)
         assert not out.terminated
         # The robot moves on with the reference, which then has no reason to re-align.
-        ahead = memory.replace(step=memory.step + 1)
+        ahead = memory._replace(step=memory.step + 1)
         memory = harness.push(memory, *harness.reference(ahead), jnp.zeros(12))
         np.testing.assert_allclose(memory.offset, ahead.offset, atol=2e-5)
 
@@ -180,7 +180,7 @@ def test_each_error_lowers_its_own_term(harness: Harness) -> None:
 def test_the_reference_moves_to_the_robot_when_the_clip_loops(harness: Harness) -> None:
     memory = harness.at(0.0)
     for step in range(1, CYCLE_STEPS + 3):
-        ahead = memory.replace(step=memory.step + 1)
+        ahead = memory._replace(step=memory.step + 1)
         reference, qvel = harness.reference(ahead)
         robot = reference.at[:3].add(jnp.array([-0.3, 0.2, 0.1]))  # behind, to the left, too high
         memory = harness.push(memory, robot, qvel, jnp.zeros(12))
@@ -279,7 +279,7 @@ def test_leaps_are_whole_cycles(harness: Harness) -> None:
     memory = harness.at(1.0)
     qpos, qvel = harness.reference(memory)
     for step, leaps in ((1, 0), (23, 0), (24, 1), (47, 1), (48, 2), (240, 10), (399, 16)):
-        late = memory.replace(step=jnp.int32(step))
+        late = memory._replace(step=jnp.int32(step))
         assert float(harness.judge(late, qpos, qvel).metrics["leaps"]) == leaps
     high = harness.judge(harness.at(0.6), *harness.reference(harness.at(0.6)))
     assert high.metrics["airborne"]

@@ -15,8 +15,7 @@ from twirl_mjx.sim.dynamics import make_dynamics
 from twirl_mjx.sim.robots import A1
 from twirl_mjx.sim.scene import build_scene
 from twirl_mjx.tasks.base import Outcome
-from twirl_mjx.tasks.cards import StandOptions
-from twirl_mjx.tasks.stand import Stand
+from twirl_mjx.tasks.stand import Stand, StandOptions
 
 FEET = StandOptions(height_of="front_feet", risen_fraction=1.0)
 

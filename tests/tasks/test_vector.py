@@ -323,7 +323,7 @@ def test_pictures_show_goal_and_bands(worlds: Callable[..., Any]) -> None:
     state = hurdles.reset(0)
     task = state.world.task
     far = state.replace(
-        world=state.world.replace(task=task.replace(positions=task.positions + 50.0))
+        world=state.world.replace(task=task._replace(positions=task.positions + 50.0))
     )
     shown, bare = hurdles.env.render(state, 1), hurdles.env.render(far, 1)
     hurdles.env.painter.close()

@@ -9,7 +9,7 @@ from twirl_mjx.commands.console import say
 from twirl_mjx.commands.options import parse_collect
 from twirl_mjx.commands.selection import the_one
 from twirl_mjx.commands.waiting import waiting
-from twirl_mjx.tasks.cards import ImitateOptions
+from twirl_mjx.tasks.imitate import ImitateOptions
 from twirl_mjx.training.config import TrainConfig
 from twirl_mjx.training.presets import starts_from_nominal_run
 

@@ -12,8 +12,7 @@ import numpy as np
 from twirl_mjx.deploy.reference import HISTORY, LIFTED, Reading, Score, quaternion_matrix
 from twirl_mjx.motion.clip import Clip, configurations, frame_velocities
 from twirl_mjx.sim import kinematics
-from twirl_mjx.tasks.cards import ImitateOptions
-from twirl_mjx.tasks.imitate import standing_time
+from twirl_mjx.tasks.imitate import ImitateOptions, standing_time
 
 CONTROL_DT = 0.05
 AHEAD = (1, 2, 7, 20)

@@ -29,8 +29,7 @@ from twirl_mjx.policies.resolve import (
     robot_of_card,
 )
 from twirl_mjx.sim.robots import A1
-from twirl_mjx.tasks.cards import ImitateOptions
-from twirl_mjx.tasks.imitate import clip_of
+from twirl_mjx.tasks.imitate import ImitateOptions, clip_of
 from twirl_mjx.tasks.registry import TASKS as ALL_TASKS
 from twirl_mjx.types import SourcePolicy
 from twirl_mjx.worlds.config import WorldConfig

@@ -205,7 +205,7 @@ def find_contract(text: str, robot: Robot) -> Contract:
     if text in READY:
         return READY[text]
     if text in TASKS.names():
-        kind = TASKS.get(text).whole()
+        kind = TASKS.get(text)
         return contract_of_task(kind(kind.paper_options(), robot=robot))
     if Path(text).suffix == ".json" or Path(text).exists():
         return schema.read(text)

@@ -32,8 +32,7 @@ from twirl_mjx.policies.onnx_file import OnnxPolicy
 from twirl_mjx.policies.ready import find_contract
 from twirl_mjx.policies.source import ActOnObs, ObservingSource, OwnTaskSource, actor_act
 from twirl_mjx.sim.robots import A1, ROBOTS
-from twirl_mjx.tasks.cards import ImitateOptions
-from twirl_mjx.tasks.imitate import clip_of
+from twirl_mjx.tasks.imitate import ImitateOptions, clip_of
 from twirl_mjx.tasks.observations import layout_size
 from twirl_mjx.tasks.registry import TASKS
 from twirl_mjx.types import SourcePolicy, Transition

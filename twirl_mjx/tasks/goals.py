@@ -2,10 +2,49 @@
 
 from __future__ import annotations
 
-import jax
-import jax.numpy as jnp
+import dataclasses
+from typing import ClassVar
 
-from twirl_mjx.tasks.cards import GoalOptions
+from etils import epy
+
+from twirl_mjx.checks import check_range
+
+with epy.lazy_imports():  # needed by worlds, not by options
+    import jax
+    import jax.numpy as jnp
+
+
+@dataclasses.dataclass(frozen=True)
+class GoalOptions:
+    """Where the goal of an episode is."""
+
+    goal_mean_radius: float = 1.5
+    """m, mean of the exponential distribution of the goal's distance."""
+    goal_min_radius: float = 0.3
+    """m, the drawn distance is clipped from below."""
+    goal_max_radius: float = 5.0
+    """m, the drawn distance is clipped from above."""
+    fixed_goal: tuple[float, float] = (1.5, 0.0)
+    """m, the goal when the course is fixed (dynamics shifts); on the hill in ``sloped``."""
+    goal_distance: float | None = None
+    """m, distance of every goal instead of a drawn one; straight ahead on a fixed course."""
+
+    PREFIX: ClassVar[str] = ""
+
+    def __post_init__(self) -> None:
+        """Check every option, or raise ValueError."""
+        check_range(f"{self.PREFIX}goal_mean_radius", self.goal_mean_radius, 0.0, 100.0)
+        check_range(f"{self.PREFIX}goal_max_radius", self.goal_max_radius, 0.0, 100.0)
+        high = self.goal_max_radius
+        check_range(f"{self.PREFIX}goal_min_radius", self.goal_min_radius, 0.0, high)
+        for coordinate in self.fixed_goal:
+            check_range(f"{self.PREFIX}fixed_goal", coordinate, -100.0, 100.0)
+        if self.goal_distance is not None:
+            check_range(f"{self.PREFIX}goal_distance", self.goal_distance, 0.01, 100.0)
+
+
+GOAL_OPTIONS = tuple(field.name for field in dataclasses.fields(GoalOptions))
+"""Options that only place the goal."""
 
 
 def draw_goal(

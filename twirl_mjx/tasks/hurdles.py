@@ -11,19 +11,26 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Mapping
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
-import flax.struct
-import jax
-import jax.numpy as jnp
 import numpy as np
+from etils import epy
 
-from twirl_mjx.sim import frames, kinematics
-from twirl_mjx.sim.dynamics import Dynamics
+from twirl_mjx.checks import check_choice, check_range
 from twirl_mjx.sim.robot import FOOT, TRUNK
-from twirl_mjx.sim.scene import BUMP_HALF_SIZE, Scene
-from twirl_mjx.tasks import bands, base, rewards
-from twirl_mjx.tasks.cards import HurdlesCard, HurdlesOptions
+from twirl_mjx.tasks.task import POLISH, Link, Measure, Task
+
+with epy.lazy_imports():  # needed by worlds, not by options
+    import jax
+    import jax.numpy as jnp
+
+    from twirl_mjx.sim import frames, kinematics
+    from twirl_mjx.sim import scene as scenes
+    from twirl_mjx.tasks import bands, base, rewards
+
+if TYPE_CHECKING:
+    from twirl_mjx.sim.dynamics import Dynamics
+    from twirl_mjx.sim.scene import Scene
 
 WEIGHTS = {"forward": 0.7, "orientation": 0.05, "joint_calm": 0.15, "hurdle": 0.1}
 """Weights of the reward terms (paper appendix, table of the jumping task)."""
@@ -32,14 +39,14 @@ PASSED = 0.4
 """m, a hurdle counts as passed when the root is this far beyond its centre (paper)."""
 MAX_SPEED = 4.0
 """m/s, there are hurdles enough for an episode at this speed (the A1's best is 3.3 m/s)."""
-BUMPY_START_X = (-BUMP_HALF_SIZE + 1.0, -BUMP_HALF_SIZE + 11.0)
-"""m, on bumpy ground episodes start in this range of x, near one edge, to run across it."""
+BUMPY_START_X = (1.0, 11.0)
+"""m, on bumpy ground episodes start this far from one edge in x, to run across it."""
 FOOT_CONTACT = 0.001
 """m, a foot below this clearance is on the ground: contacts on a slope, measured straight down,
 begin above 0."""
 
 
-class HurdlesState(flax.struct.PyTreeNode):
+class HurdlesState(NamedTuple):
     """State of the task in one world."""
 
     start: jax.Array
@@ -54,7 +61,7 @@ class HurdlesState(flax.struct.PyTreeNode):
     """[H] bool, passed with all feet off the ground during the whole crossing."""
 
 
-class Crossing(flax.struct.PyTreeNode):
+class Crossing(NamedTuple):
     """What the substeps of one control step mean for the hurdles."""
 
     hit: jax.Array
@@ -90,8 +97,7 @@ def advance(state: HurdlesState, crossing: Crossing, x: jax.Array) -> HurdlesSta
     beyond = state.positions + PASSED < x
     stepped_in = state.stepped_in | crossing.stepped_in
     behind = crossing.last_foot > state.positions + bands.HURDLE_LENGTH / 2
-    return dataclasses.replace(
-        state,
+    return state._replace(
         passed=jnp.maximum(state.passed, jnp.sum(beyond, dtype=jnp.int32)),
         stepped_in=stepped_in,
         cleared=state.cleared | (beyond & behind & ~stepped_in),
@@ -117,8 +123,60 @@ HURDLES_SUCCESS = 2
 """Hurdles passed that make an episode a success (the paper's courses have two)."""
 
 
-class Hurdles(HurdlesCard):
+@dataclasses.dataclass(frozen=True)
+class HurdlesOptions:
+    """Task ``hurdles``: jump over randomly spaced hurdles."""
+
+    min_gap: float = 1.6
+    """m, smallest distance between neighbouring hurdles, and to the first."""
+    max_gap: float = 2.6
+    """m, largest distance."""
+    fixed_gap: float = 2.1
+    """m, distance when the course is fixed (dynamics shifts)."""
+    gap: float | None = None
+    """m, distance of all hurdles, on a fixed and on a random course, instead of the above."""
+    hurdle_bonus: Literal["count", "event", "clean"] = "count"
+    """Pay the number of hurdles passed so far at every step, or 1 when one is passed, or the
+    number passed in a single flight so far at every step."""
+
+    def __post_init__(self) -> None:
+        """Check the options (the task has a stricter check of the gaps), or raise ValueError."""
+        check_choice("hurdles.hurdle_bonus", self.hurdle_bonus, ("count", "event", "clean"))
+        for name in ("min_gap", "max_gap", "fixed_gap"):
+            check_range(f"hurdles.{name}", getattr(self, name), 0.0, 1000.0)
+        if self.gap is not None:
+            check_range("hurdles.gap", self.gap, 0.0, 1000.0)
+
+
+class Hurdles(Task[HurdlesOptions]):
     """See the module docstring."""
+
+    name = "hurdles"
+    Options = HurdlesOptions
+    source = "imitate"
+    measures = {
+        "hurdles_passed": Measure("hurdles_passed", "max", 1.0, "1", "hurdles passed"),
+        "clean_clearances": Measure(
+            "clean_clearances", "max", 1.0, "1", "hurdles passed in a single flight phase"
+        ),
+        "hit_hurdle": Measure(
+            "hit_hurdle", "max", 1.0, "share", "ended by touching a hurdle", True
+        ),
+        "fall": Measure(
+            "fall", "max", 1.0, "share", "ended by the trunk touching the ground", True
+        ),
+        "distance_x": Measure("distance_x", "max", 1.0, "m", "way made along x"),
+    }
+    lead = ("hurdles_passed", "single_flight", "return")
+    ratios = {"single_flight": ("clean_clearances", "hurdles_passed")}
+    chain = (
+        Link("imitate", {"task": "imitate"}),
+        Link("hurdles", {"task": "hurdles"}),
+        # Gaps up to a little more than the 3.6 m of the paper's tests: the task has no such.
+        Link("polish", {"task": "hurdles", "hurdles.max_gap": 3.7} | POLISH),
+    )
+    course_options = ("min_gap", "max_gap", "fixed_gap", "gap")
+    caption = ("hurdles_passed",)
 
     def __init__(self, options: HurdlesOptions | None = None, **setting: Any) -> None:
         """Keep the options of the task.
@@ -149,7 +207,7 @@ class Hurdles(HurdlesCard):
         pose_key, place_key, band_key = jax.random.split(key, 3)
         qpos, qvel = base.start_on_feet(pose_key, scene, dynamics)
         if scene.kind == "bumpy":
-            low, high = BUMPY_START_X
+            low, high = (x - scenes.BUMP_HALF_SIZE for x in BUMPY_START_X)
             x = jax.random.uniform(place_key, minval=low, maxval=high)
             qpos = base.place_on_ground(scene, dynamics, qpos.at[0].set(x))
         none = jnp.zeros(self.num_hurdles, bool)

@@ -15,26 +15,32 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
-from typing import cast
+from typing import TYPE_CHECKING, NamedTuple, cast
 
-import flax.struct
-import jax
-import jax.numpy as jnp
 import numpy as np
+from etils import epy
 
 from twirl_mjx.assets import asset_path
-from twirl_mjx.motion.clip import Clip, headings, sample
-from twirl_mjx.motion.conversion import AS_IS, Conversion
-from twirl_mjx.motion.formats import foot_paths
-from twirl_mjx.motion.retarget import read_motion
-from twirl_mjx.sim import frames, kinematics
-from twirl_mjx.sim.dynamics import Dynamics
-from twirl_mjx.sim.robot import CONTROL_DT, HIP, ROOT_SIZE, THIGH, TRUNK, Robot
+from twirl_mjx.checks import check_range
+from twirl_mjx.motion.conversion import AS_IS, ClipOptions, Conversion
+from twirl_mjx.sim.robot import HIP, ROOT_SIZE, THIGH, TRUNK, Robot
 from twirl_mjx.sim.robots import A1, ROBOTS
-from twirl_mjx.sim.scene import Scene
-from twirl_mjx.tasks import base, rewards
-from twirl_mjx.tasks.cards import ImitateCard, ImitateOptions
-from twirl_mjx.tasks.observations import HISTORY, Entry, in_history
+from twirl_mjx.tasks.task import Measure, Task
+
+with epy.lazy_imports():  # needed by worlds, not by options
+    import jax
+    import jax.numpy as jnp
+
+    from twirl_mjx.motion import clip as clips
+    from twirl_mjx.motion import formats, retarget
+    from twirl_mjx.sim import frames, kinematics
+    from twirl_mjx.tasks import base, observations, rewards
+
+if TYPE_CHECKING:
+    from twirl_mjx.motion.clip import Clip
+    from twirl_mjx.sim.dynamics import Dynamics
+    from twirl_mjx.sim.scene import Scene
+    from twirl_mjx.tasks.observations import Entry
 
 WEIGHTS = {
     "pose": 0.5,
@@ -60,12 +66,14 @@ def make_layout(robot: Robot) -> tuple[Entry, ...]:
 
     ``_h``: in the heading frame (world axes turned by the robot's yaw at that time); w >= 0.
     """
-    tilt = Entry("base_quat_h", 4, "1", 0.005)  # half an angle of 0.01 rad
-    joints = Entry("joint_pos", robot.num_joints, "rad", 0.005)
+    entry = observations.Entry
+    tilt = entry("base_quat_h", 4, "1", 0.005)  # half an angle of 0.01 rad
+    joints = entry("joint_pos", robot.num_joints, "rad", 0.005)
     reference = joints._replace(noise=0.0)  # known without sensors
-    target = (Entry("base_displacement_h", 3, "m", 0.01), tilt, reference)
+    target = (entry("base_displacement_h", 3, "m", 0.01), tilt, reference)
+    frame = (tilt, joints, entry("previous_action", robot.num_joints, "1"))
     return (
-        *in_history((tilt, joints, Entry("previous_action", robot.num_joints, "1"))),
+        *observations.in_history(frame),
         *(e._replace(name=f"target_{e.name}[+{i}]") for i in TARGET_STEPS for e in target),
     )
 
@@ -98,7 +106,7 @@ def load_clip(
             f" (nearest: --imitate.clip-robot {A1.name}, which follows its feet)"
         )
     path = asset_path(A1.name, "leap.json") if name == "leap" else name
-    clip = read_motion(path, robot, legs, conversion, recorded_on)
+    clip = retarget.read_motion(path, robot, legs, conversion, recorded_on)
     if clip.loop != "wrap":
         raise ValueError(
             f"imitate.clip {name!r} has loop mode {clip.loop!r}, which ends after one cycle;"
@@ -117,7 +125,7 @@ def facing_x(clip: Clip) -> Clip:
     """Return the clip turned about the world z-axis so that its mean heading is +x."""
     from scipy.spatial.transform import Rotation  # takes long to import
 
-    yaw = headings(clip.root_quat)
+    yaw = clips.headings(clip.root_quat)
     mean = np.arctan2(np.sin(yaw).mean(), np.cos(yaw).mean())
     turn = Rotation.from_euler("z", -mean)
     quat = turn * Rotation.from_quat(clip.root_quat, scalar_first=True)
@@ -131,7 +139,7 @@ def standing_time(clip: Clip) -> float:
 
     That is the frame with all feet lowest; of several such frames, the one the root leaves slowest.
     """
-    highest_foot = foot_paths(clip)[:-1, :, 2].max(axis=1)
+    highest_foot = formats.foot_paths(clip)[:-1, :, 2].max(axis=1)
     speed = np.linalg.norm(np.diff(clip.root_pos[:, :2], axis=0), axis=1)
     standing = highest_foot <= highest_foot.min() + STANDING_TOLERANCE
     return float(np.where(standing, speed, np.inf).argmin() * clip.frame_duration)
@@ -149,7 +157,7 @@ def feet_from_root(robot: Robot, qpos: jax.Array) -> jax.Array:
     return frames.rotate(tilt, kinematics.foot_positions(robot, qpos[7:]))
 
 
-class ImitateMemory(flax.struct.PyTreeNode):
+class ImitateMemory(NamedTuple):
     """Memory of :class:`ImitateObserver`: the reference's clock and place, and a history."""
 
     start_time: jax.Array
@@ -160,13 +168,6 @@ class ImitateMemory(flax.struct.PyTreeNode):
     """[2] m, added to the clip's root xy."""
     history: jax.Array
     """[HISTORY, F] the last frames (quaternion without yaw, joints, action), oldest first."""
-    control_dt: float = flax.struct.field(pytree_node=False, default=CONTROL_DT)
-    """s, control step."""
-
-    @property
-    def elapsed(self) -> jax.Array:
-        """Time in s since the start of the episode."""
-        return self.step * jnp.float32(self.control_dt)
 
 
 class ImitateObserver:
@@ -195,12 +196,12 @@ class ImitateObserver:
     def init_at(self, time: jax.Array, qpos: jax.Array, qvel: jax.Array) -> ImitateMemory:
         """Start the clip at ``time`` in s, at the robot's place."""
         del qvel
+        first = _frame(qpos, jnp.zeros_like(qpos[ROOT_SIZE:]))
         return ImitateMemory(
             start_time=time,
             step=jnp.zeros((), jnp.int32),
             offset=self._offset(time, qpos),
-            history=jnp.tile(_frame(qpos, jnp.zeros_like(qpos[ROOT_SIZE:])), (HISTORY, 1)),
-            control_dt=self.control_dt,
+            history=jnp.tile(first, (observations.HISTORY, 1)),
         )
 
     def push(
@@ -209,11 +210,11 @@ class ImitateObserver:
         """Advance clock and history; a new cycle starts at the robot's place."""
         del qvel
         history = jnp.concatenate([memory.history[1:], _frame(qpos, action)[None]])
-        new = dataclasses.replace(memory, step=memory.step + 1, history=history)
+        new = memory._replace(step=memory.step + 1, history=history)
         time = self.time(new)
         looped = self.cycles(time) > self.cycles(self.time(memory))
         offset = jnp.where(looped, self._offset(time, qpos), new.offset)
-        return dataclasses.replace(new, offset=offset)
+        return new._replace(offset=offset)
 
     def observe(
         self, memory: ImitateMemory, goal: jax.Array, qpos: jax.Array, qvel: jax.Array
@@ -221,20 +222,24 @@ class ImitateObserver:
         """Return the numbers [O] in the order of ``layout``; the goal is not looked at."""
         del goal, qvel
         times = self.time(memory) + self.control_dt * jnp.array(TARGET_STEPS, jnp.float32)
-        target = jax.vmap(lambda time: sample(self.clip, time)[0])(times)
+        target = jax.vmap(lambda time: clips.sample(self.clip, time)[0])(times)
         target = target.at[:, :2].add(memory.offset)
         yaw = frames.yaw(qpos[3:7])
         displacement = frames.rotate(frames.from_yaw(-yaw), target[:, :3] - qpos[:3])
         poses = [displacement, to_heading(target[:, 3:7], yaw), target[:, 7:]]
         return jnp.concatenate([memory.history.ravel(), jnp.concatenate(poses, axis=1).ravel()])
 
+    def elapsed(self, memory: ImitateMemory) -> jax.Array:
+        """Return the time in s since the start of the episode."""
+        return memory.step * jnp.float32(self.control_dt)
+
     def time(self, memory: ImitateMemory) -> jax.Array:
         """Return the clip time in s, over all cycles."""
-        return memory.start_time + memory.elapsed
+        return memory.start_time + self.elapsed(memory)
 
     def reference(self, memory: ImitateMemory) -> tuple[jax.Array, jax.Array]:
         """Return qpos [7 + J] and qvel [6 + J] of the reference at present."""
-        qpos, qvel = sample(self.clip, self.time(memory))
+        qpos, qvel = clips.sample(self.clip, self.time(memory))
         return qpos.at[:2].add(memory.offset), qvel
 
     def cycles(self, elapsed: jax.Array) -> jax.Array:
@@ -244,7 +249,7 @@ class ImitateObserver:
 
     def _offset(self, time: jax.Array, qpos: jax.Array) -> jax.Array:
         """Return the offset [2] in m that puts the reference at the robot's xy at ``time``."""
-        return qpos[:2] - sample(self.clip, time)[0][:2]
+        return qpos[:2] - clips.sample(self.clip, time)[0][:2]
 
 
 def _frame(qpos: jax.Array, action: jax.Array) -> jax.Array:
@@ -253,7 +258,7 @@ def _frame(qpos: jax.Array, action: jax.Array) -> jax.Array:
     return jnp.concatenate([tilt, qpos[7:], action])
 
 
-class ImitateState(flax.struct.PyTreeNode):
+class ImitateState(NamedTuple):
     """State of the task in one world."""
 
     airborne_steps: jax.Array
@@ -268,8 +273,47 @@ LEAPS_SUCCESS = 3
 """Leaps in a row that make an episode a success."""
 
 
-class Imitate(ImitateCard):
+@dataclasses.dataclass(frozen=True)
+class ImitateOptions(ClipOptions):
+    """Task ``imitate``: track a leap clip."""
+
+    clip: str = "leap"
+    """``leap`` (ours) or the path of a clip file (.json, .txt, .npy, .csv)."""
+    standing_fraction: float = 0.0
+    """Share of episodes started at rest on four feet, as the episodes of ``hurdles`` are."""
+    max_root_error: float = 1.0
+    """m, an episode ends beyond this distance from the reference root."""
+    max_root_angle: float = 1.5707963
+    """rad, an episode ends beyond this rotation from the reference root."""
+
+    def __post_init__(self) -> None:
+        """Check every number, or raise ValueError."""
+        super().__post_init__()
+        check_range("imitate.standing_fraction", self.standing_fraction, 0.0, 1.0)
+        check_range("imitate.max_root_error", self.max_root_error, 1e-3, 1e3)
+        check_range("imitate.max_root_angle", self.max_root_angle, 1e-3, 3.1416)
+
+
+class Imitate(Task[ImitateOptions]):
     """See the module docstring."""
+
+    name = "imitate"
+    Options = ImitateOptions
+    collision = "feet"
+    measures = {
+        "tracking": Measure("tracking", "mean", 1.0, "1", "mean reward over its maximum"),
+        "leaps": Measure("leaps", "max", 1.0, "1", "cycles of the clip survived"),
+        "flights": Measure("flights", "max", 1.0, "1", "cycles with a flight of 4 steps or more"),
+    }
+    presets = {
+        "paper": {"imitate.standing_fraction": 0.2},
+        # Random actions hardly ever track the clip: it starts from planned ones.
+        "cpu": {"variant": "twirl", "source": "clip", "total_env_steps": 1_600_000,
+                "droq.discount": 0.95},
+    }  # fmt: skip
+    course_options = ("standing_fraction",)
+    training_options = ("standing_fraction",)
+    caption = ("tracking",)
 
     def make_observer(self) -> ImitateObserver:
         """Load the clip.
@@ -293,7 +337,7 @@ class Imitate(ImitateCard):
         place_key, phase_key, pose_key, standing_key = jax.random.split(key, 4)
         phase = jax.random.uniform(phase_key, maxval=self.follower.duration)
         xy = base.start_xy(place_key, scene)
-        qpos, qvel = sample(self.follower.clip, phase)
+        qpos, qvel = clips.sample(self.follower.clip, phase)
         qpos = qpos.at[:2].set(xy).at[2].add(base.ground_at(scene, dynamics, xy))
         endpoints = kinematics.forward(scene.robot, qpos).endpoints
         lowest = jnp.min(base.clearances(scene, dynamics, endpoints))
@@ -337,8 +381,9 @@ class Imitate(ImitateCard):
         fall = base.touches(view, TRUNK, HIP, THIGH) | base.knees_touch(view)
         lost = (distance > options.max_root_error) | (angle > options.max_root_angle)
         airborne = jnp.all(base.foot_clearance(view) > base.LIFTED)
-        leaps = self.follower.cycles(world.memory.elapsed)
-        completed = leaps > self.follower.cycles(world.memory.elapsed - self.robot.control_dt)
+        elapsed = self.follower.elapsed(world.memory)
+        leaps = self.follower.cycles(elapsed)
+        completed = leaps > self.follower.cycles(elapsed - self.robot.control_dt)
         task = count_flights(world.task, airborne, completed)
         return base.Outcome(
             reward=reward,

@@ -13,7 +13,7 @@ BUILT_IN = ("stand", "biped", "imitate", "hurdles")
 
 
 def accept(item: Any) -> type[Task]:
-    """Return a task class after checking what it says of itself; of a built-in one, its card.
+    """Return a task class after checking what it says of itself.
 
     Raises:
         ValueError: It is no task, or a part of it has another form; one line.
@@ -39,7 +39,7 @@ def accept(item: Any) -> type[Task]:
     for key, measure in item.measures.items():
         if not isinstance(measure, Measure):
             raise ValueError(f"{_called(item)}.measures[{key!r}] is no Measure: {measure!r}")
-    return item.card()
+    return item
 
 
 def _called(item: Any) -> str:
@@ -50,7 +50,7 @@ TASKS: Registry[type[Task]] = Registry(
     "task",
     accept=accept,
     group="twirl_mjx.tasks",
-    shipped={name: f"twirl_mjx.tasks.cards:{name.title()}Card" for name in BUILT_IN},
+    shipped={name: f"twirl_mjx.tasks.{name}:{name.title()}" for name in BUILT_IN},
 )
 """The one list of tasks."""
 

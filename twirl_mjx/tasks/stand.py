@@ -9,19 +9,28 @@ observation, and the source has learned to ignore the goal.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping
+from typing import TYPE_CHECKING, Literal
 
-import jax
-import jax.numpy as jnp
+from etils import epy
 
-from twirl_mjx.sim import frames
-from twirl_mjx.sim.dynamics import Dynamics
+from twirl_mjx.checks import check_choice, check_range
 from twirl_mjx.sim.robot import CALF, HIP, THIGH, TRUNK
-from twirl_mjx.sim.scene import Scene
-from twirl_mjx.tasks import base, rewards
-from twirl_mjx.tasks.cards import StandCard
-from twirl_mjx.tasks.goals import draw_goal
-from twirl_mjx.tasks.observations import Observer, ProprioceptiveObserver
+from twirl_mjx.tasks.goals import GOAL_OPTIONS, GoalOptions, draw_goal
+from twirl_mjx.tasks.task import Measure, Task
+
+with epy.lazy_imports():  # needed by worlds, not by options
+    import jax
+    import jax.numpy as jnp
+
+    from twirl_mjx.sim import frames
+    from twirl_mjx.tasks import base, observations, rewards
+
+if TYPE_CHECKING:
+    from twirl_mjx.sim.dynamics import Dynamics
+    from twirl_mjx.sim.scene import Scene
+    from twirl_mjx.tasks.observations import Observer
 
 RISEN_PITCH_DEG = 83.0
 """deg, risen episodes start at pitch = U(0, 83)."""
@@ -29,13 +38,57 @@ RISEN_PITCH_DEG = 83.0
 STANDING_SUCCESS_S = 12.0
 """s, standing time the paper's robot reaches (12.12 s), and our bar."""
 
+STANDING_MEASURES = {
+    "standing_time": Measure(
+        "standing", "time", 1.0, "s", "time with c >= 0.7 and both front feet lifted"
+    ),
+    "on_feet": Measure("on_feet", "time", 1.0, "s", "standing time with no calf on the ground"),
+    "cosine": Measure("cosine", "mean", 1.0, "1", "mean vertical part of the base x-axis"),
+}
+"""What is measured of a robot that should be on its hind legs."""
 
-class Stand(StandCard):
+
+@dataclasses.dataclass(frozen=True)
+class StandOptions(GoalOptions):
+    """Task ``stand``: get up on the hind legs."""
+
+    height_of: Literal["root", "front_feet"] = "root"
+    """Which height r_height rewards: the root's or the front feet's mean (docs/decisions.md)."""
+    risen_fraction: float = 0.0
+    """Share of episodes started part-way up on the hind legs, at pitch U(0, 83 deg)."""
+
+    PREFIX = "stand."
+
+    def __post_init__(self) -> None:
+        """Check the options.
+
+        Raises:
+            ValueError: A value is out of range.
+        """
+        super().__post_init__()
+        check_choice("stand.height_of", self.height_of, ("root", "front_feet"))
+        check_range("stand.risen_fraction", self.risen_fraction, 0.0, 1.0)
+
+
+class Stand(Task[StandOptions]):
     """See the module docstring."""
+
+    name = "stand"
+    Options = StandOptions
+    collision = "feet"
+    measures = STANDING_MEASURES
+    lead = ("return", "standing_time", "on_feet")
+    presets = {
+        "paper": {"stand.height_of": "front_feet"},
+        "cpu": {"stand.risen_fraction": 0.9, "episode_length": 100},
+    }
+    course_options = (*GOAL_OPTIONS, "risen_fraction")
+    training_options = ("risen_fraction",)
+    caption = ("cosine",)
 
     def make_observer(self) -> Observer:
         """Show the goal, the history and the base axes."""
-        return ProprioceptiveObserver(self.robot, axes=True)
+        return observations.ProprioceptiveObserver(self.robot, axes=True)
 
     def start(self, key: jax.Array, scene: Scene, dynamics: Dynamics) -> base.Start:
         """Start on four feet, or part-way up in a share ``risen_fraction`` of the episodes."""

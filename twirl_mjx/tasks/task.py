@@ -4,16 +4,15 @@ A task is one class in one file. It holds the MDP (``start``, ``judge``, an obse
 what is measured of an episode and when it is a success, its default source, and what presets,
 courses and films need. Everything that lists tasks, or anything of a task, asks ``registry``.
 
-This module needs neither jax nor MuJoCo, so that options are parsed without them. For the same
-reason a built-in task is two classes: its card (``cards``) and, derived from it, the MDP.
+This module and those of the built-in tasks import neither jax nor MuJoCo before a world is built,
+so that options are parsed without them.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import importlib
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 
@@ -56,6 +55,14 @@ class Link(NamedTuple):
     """Field of the run's config -> value, ``task`` among them; the rest is the preset's."""
 
 
+POLISH = {
+    "variant": "twirl+weights",
+    "droq.target_entropy": -12.0,
+    "droq.learning_rate": 1e-4,
+}
+"""Settings of a link for a skill that is there: less exploration noise and smaller steps."""
+
+
 @dataclasses.dataclass(frozen=True)
 class NoOptions:
     """Options of a task that has none."""
@@ -90,16 +97,8 @@ class Task[O]:
     """Metrics written into films."""
     shows_goal: ClassVar[bool] = False
     """Whether films show the goal."""
-    mdp: ClassVar[str] = ""
-    """``module:Class`` of the whole task, where this class only says what is known of it."""
-
     observer: Observer
     """What the policy sees."""
-
-    def __new__(cls, *args: Any, **settings: Any) -> Self:
-        """Return an object of the whole task, also where a card is asked for one."""
-        del args, settings
-        return super().__new__(cls.whole())  # type: ignore[return-value]
 
     def __init__(
         self,
@@ -153,20 +152,6 @@ class Task[O]:
         """Return the world x [H] in m of hurdle bands to draw, given one world's task state."""
         del state
         return np.zeros(0)
-
-    @classmethod
-    def whole(cls) -> type[Task[O]]:
-        """Return the class that can be simulated: that of a card's MDP, else this one."""
-        if "mdp" not in vars(cls):
-            return cls
-        module, _, name = cls.mdp.partition(":")
-        return getattr(importlib.import_module(module), name)
-
-    @classmethod
-    def card(cls) -> type[Task[O]]:
-        """Return the card of a built-in task, else this class."""
-        is_whole = cls.mdp == f"{cls.__module__}:{cls.__qualname__}"
-        return cls.__bases__[0] if is_whole else cls
 
     @classmethod
     def check_options(cls, options: Any) -> None:
