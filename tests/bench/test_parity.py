@@ -50,7 +50,7 @@ def test_a_command_that_fails_is_told(tmp_path: Path, monkeypatch: pytest.Monkey
 @pytest.mark.slow
 def test_learner_numbers_move_and_are_complete() -> None:
     found = parity.learner_numbers()
-    for form in ("plain", "fast", "accelerator"):
+    for form in ("plain", "fast", "accelerator", "kernels"):
         assert np.linalg.norm(found[f"learner.{form}.critic"]) > 1e-3
         assert np.isfinite(found[f"learner.{form}.critic_loss"])
     assert parity.errors(found, found) == dict.fromkeys(found, 0.0)

@@ -3,13 +3,24 @@
 from __future__ import annotations
 
 import dataclasses
+from types import ModuleType
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from twirl_mjx.droq import accelerator, dropout, fast, forms, fused, learner, packing, plain
+from twirl_mjx.droq import (
+    accelerator,
+    dropout,
+    fast,
+    forms,
+    fused,
+    kernels,
+    learner,
+    packing,
+    plain,
+)
 from twirl_mjx.droq.config import DroqConfig
 from twirl_mjx.droq.state import CriticState
 
@@ -44,19 +55,27 @@ def critic_state(state):
     return CriticState(state.critic, state.target_critic, state.critic_opt)
 
 
-@FAST_FORMS
 @pytest.mark.parametrize(
-    ("hidden_sizes", "num_critics"),
+    ("form", "hidden_sizes", "num_critics", "rows"),
     [
-        ((32, 16), 2),
-        ((24,), 1),
-        pytest.param((16, 20, 8), 3, marks=pytest.mark.slow),
+        (fast, (32, 16), 2, 8),
+        (fast, (24,), 1, 8),
+        pytest.param(fast, (16, 20, 8), 3, 8, marks=pytest.mark.slow),
+        (accelerator, (32, 16), 2, 8),
+        (accelerator, (24,), 1, 8),
+        pytest.param(accelerator, (16, 20, 8), 3, 8, marks=pytest.mark.slow),
+        (kernels, (32, 16), 2, 32),
+        pytest.param(kernels, (64,), 1, 16, marks=pytest.mark.slow),
+        pytest.param(kernels, (64, 32, 128), 3, 32, marks=pytest.mark.slow),
     ],
-)
+    ids=lambda value: value.__name__.split(".")[-1] if isinstance(value, ModuleType) else None,
+)  # fmt: skip
 def test_block_equals_explicit_plain_steps_with_the_same_masks(
-    small_config, transitions, hidden_sizes, num_critics, form
+    small_config, transitions, form, hidden_sizes, num_critics, rows
 ):
-    config = dataclasses.replace(small_config, hidden_sizes=hidden_sizes, num_critics=num_critics)
+    config = dataclasses.replace(
+        small_config, hidden_sizes=hidden_sizes, num_critics=num_critics, batch_size=rows
+    )
     keys = jax.random.split(jax.random.key(0), 4)
     state = learner.init(keys[0], config, OBS_SIZE, ACTION_SIZE)
     batch = transitions(keys[1], U, config.batch_size)
@@ -87,6 +106,42 @@ def test_block_equals_explicit_plain_steps_with_the_same_masks(
     # The comparison is not between two states that never moved.
     change = jax.tree.map(lambda a, b: float(jnp.abs(a - b).max()), actual.critic, state.critic)
     assert min(jax.tree.leaves(change)) > 1e-3
+
+
+@pytest.mark.slow
+def test_kernels_are_the_same_for_several_learners_at_once(small_config, transitions):
+    """Learners side by side (``vmap``) become what each becomes alone."""
+    config = dataclasses.replace(small_config, batch_size=16, form="kernels")
+    keys = jax.random.split(jax.random.key(0), 2)
+    states = jax.vmap(lambda key: learner.init(key, config, OBS_SIZE, ACTION_SIZE))(keys)
+    batches = jax.vmap(lambda key: transitions(key, U, 16))(keys)
+    noise = jax.random.normal(keys[1], (2, U, 16, ACTION_SIZE))
+
+    def block(state, batch, noise, key):
+        temperature = jnp.float32(0.3)
+        critics = critic_state(state)
+        return kernels.critic_block(critics, state.actor, temperature, config, batch, noise, key)
+
+    together, _ = jax.jit(jax.vmap(block))(states, batches, noise, keys)
+    for i in range(2):
+        alone, _ = jax.jit(block)(
+            *jax.tree.map(lambda x, i=i: x[i], (states, batches, noise, keys))
+        )
+        assert_trees_close(jax.tree.map(lambda x, i=i: x[i], together), alone, rtol=1e-6, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("settings", "reason"),
+    [
+        ({"hidden_sizes": (256, 100)}, r"powers of two from 16, not 100 \(nearest: 128\)"),
+        ({"hidden_sizes": (8,)}, r"not 8 \(nearest: 16\)"),
+        ({"batch_size": 250}, r"multiple of 16, not 250 \(nearest: 256\)"),
+    ],
+)
+def test_kernels_refuse_what_they_cannot_cut_into_blocks(settings, reason):
+    with pytest.raises(ValueError, match=reason):
+        DroqConfig(form="kernels", **settings)
+    DroqConfig(form="accelerator", **settings)
 
 
 @FAST_FORMS

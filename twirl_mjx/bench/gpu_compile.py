@@ -56,7 +56,7 @@ class GpuCompileBench:
     """block (critic updates), update (with actor and temperature), epoch (without physics), worlds
     (MJX)."""
     forms: tuple[str, ...] = tuple(forms.FORMS)
-    """Forms of the learner: plain, fast, accelerator."""
+    """Forms of the learner: plain, fast, accelerator, kernels."""
     seeds: tuple[int, ...] = (1, 8)
     """Learners in one program."""
     num_envs: int = 1024
@@ -237,6 +237,7 @@ def measure(options: GpuCompileBench) -> Record:
     """
     if (reason := compiler_missing()) is not None:
         raise RuntimeError(reason)
+    jax.config.update("jax_enable_compilation_cache", False)  # it cannot load what runs elsewhere
     cells = [
         (program, form, seeds)
         for program in options.programs

@@ -119,6 +119,8 @@ def variants(options: GpuProofBench) -> list[Variant]:
         learner("accelerator", 1, "loops in graphs", GRAPHS),
         learner("accelerator", 8, "loops in graphs", GRAPHS),
         learner("accelerator", 1, "no graphs", NO_GRAPHS),
+        learner("kernels", 1),
+        learner("kernels", 8),
         learner("accelerator", 32),
         learner("accelerator", 8, "bfloat16", matmul_dtype="bfloat16"),
         *(worlds("mjx", number) for number in (256, 8192)),

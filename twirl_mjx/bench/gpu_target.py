@@ -145,7 +145,11 @@ def compile_for(
     shapes = jax.tree.map(
         lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=place), tuple(args)
     )
-    lowered = jax.jit(function, donate_argnums=donate).lower(*shapes)
+    device = jax.sharding.AbstractDevice(topology.devices[0].device_kind, None, "cuda")
+    automatic = (jax.sharding.AxisType.Auto,)
+    mesh = jax.sharding.AbstractMesh((1,), ("x",), automatic, abstract_device=device)
+    with jax.sharding.use_abstract_mesh(mesh):  # Pallas asks it for what it compiles
+        lowered = jax.jit(function, donate_argnums=donate).lower(*shapes)
     with tempfile.TemporaryDirectory() as folder:
         dump = {"xla_dump_to": folder, "xla_dump_hlo_as_text": True}
         began = time.perf_counter()

@@ -64,9 +64,9 @@ class LearnerBench:
     """Learners in one program (a vmap axis); as many as CPUs by default, at least 2."""
     workers: int | None = None
     """Learners in processes pinned to one CPU each; as many as CPUs by default, 0 for none."""
-    form: Literal["auto", "plain", "fast", "accelerator"] = "auto"
-    """Form of the update: the plain flax/optax one, fast (CPUs), accelerator (GPUs and TPUs);
-    auto is the one of the machine."""
+    form: Literal["auto", "plain", "fast", "accelerator", "kernels"] = "auto"
+    """Form of the update: the plain flax/optax one, fast (CPUs), accelerator (GPUs and TPUs),
+    kernels (GPUs); auto is the one of the machine."""
     matmul_dtype: Literal["float32", "bfloat16"] = "float32"
     """Precision of matrix products (SBX always uses float32)."""
     sbx: bool = True

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from typing import Literal
 
 from twirl_mjx.checks import check_choice, check_range
@@ -38,9 +39,9 @@ class DroqConfig:
     """Precision of matrix products; parameters and sums stay float32."""
     fast: bool = True
     """Use the fast form of the update; False is the plain flax/optax form of the same maths."""
-    form: Literal["auto", "fast", "accelerator"] = "auto"
+    form: Literal["auto", "fast", "accelerator", "kernels"] = "auto"
     """Which fast form: fast is laid out for CPUs, accelerator for GPUs and TPUs, auto for what is
-    used."""
+    used; kernels are hand-written ones for GPUs that have not run on any yet."""
 
     def __post_init__(self) -> None:
         """Check every number.
@@ -60,9 +61,27 @@ class DroqConfig:
         if self.target_entropy is not None:
             check_range("droq.target_entropy", self.target_entropy, -1e4, 1e4)
         check_choice("droq.matmul_dtype", self.matmul_dtype, ("float32", "bfloat16"))
-        check_choice("droq.form", self.form, ("auto", "fast", "accelerator"))
+        check_choice("droq.form", self.form, ("auto", "fast", "accelerator", "kernels"))
         if not self.hidden_sizes or min(self.hidden_sizes) < 1:
             nearest = tuple(max(1, size) for size in self.hidden_sizes or (128, 128))
             raise ValueError(
                 f"droq.hidden_sizes = {self.hidden_sizes} needs sizes >= 1 (nearest: {nearest})"
+            )
+        if self.form == "kernels":
+            self._check_kernels()
+
+    def _check_kernels(self) -> None:
+        """Refuse sizes that hand-written kernels cannot cut into blocks, or raise ValueError."""
+        for size in self.hidden_sizes:
+            if size < 16 or size & (size - 1):
+                nearest = max(16, 1 << round(math.log2(size)))
+                raise ValueError(
+                    f"droq.form kernels needs hidden sizes that are powers of two from 16, not"
+                    f" {size} (nearest: {nearest})"
+                )
+        if self.batch_size % 16:
+            nearest = max(16, round(self.batch_size / 16) * 16)
+            raise ValueError(
+                f"droq.form kernels needs a batch size that is a multiple of 16, not"
+                f" {self.batch_size} (nearest: {nearest})"
             )

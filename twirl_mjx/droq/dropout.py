@@ -47,7 +47,7 @@ def hash_bits(seed: jax.Array, num: int) -> jax.Array:
     return _hash(seed, jnp.arange(num, dtype=jnp.uint32))
 
 
-def _hash(seed: jax.Array, counter: jax.Array) -> jax.Array:
+def _hash(seed: jax.Array | tuple[jax.Array, jax.Array], counter: jax.Array) -> jax.Array:
     """Return 32 random bits for every counter.
 
     The finaliser of MurmurHash3 (Appleby, public domain) with the seed entering twice, before and
@@ -83,7 +83,28 @@ def keep_mask_by_element(seed: jax.Array, shape: tuple[int, int, int], rate: flo
     of in a kernel of its own.
     """
     member, row, column = (jax.lax.broadcasted_iota(jnp.uint32, shape, i) for i in range(3))
-    place = row * jnp.uint32(shape[2]) + column
-    counter = (member // 2) * jnp.uint32(shape[1] * shape[2]) + place
+    return keep_at((seed[0], seed[1]), member, row, column, shape[1:], rate)
+
+
+def keep_at(
+    seed: tuple[jax.Array, jax.Array],
+    member: jax.Array,
+    row: jax.Array,
+    column: jax.Array,
+    shape: tuple[int, int],
+    rate: float,
+) -> jax.Array:
+    """Return what :func:`keep_mask` says of some elements.
+
+    Args:
+        seed: The two halves of the hash seed.
+        member: Ensemble members of the elements, uint32.
+        row: Their rows, uint32.
+        column: Their columns, uint32.
+        shape: Rows and columns of the whole mask.
+        rate: Probability of dropping an element, rounded to a multiple of 1 / RESOLUTION.
+    """
+    rows, columns = shape
+    counter = (member // 2) * jnp.uint32(rows * columns) + row * jnp.uint32(columns) + column
     half = (_hash(seed, counter) >> (16 * (member % 2))) & 0xFFFF
     return half >= threshold(rate)

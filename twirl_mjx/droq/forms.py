@@ -7,10 +7,15 @@ from typing import Any
 
 import jax
 
-from twirl_mjx.droq import accelerator, fast, plain
+from twirl_mjx.droq import accelerator, fast, kernels, plain
 from twirl_mjx.droq.config import DroqConfig
 
-FORMS: dict[str, ModuleType] = {"plain": plain, "fast": fast, "accelerator": accelerator}
+FORMS: dict[str, ModuleType] = {
+    "plain": plain,
+    "fast": fast,
+    "accelerator": accelerator,
+    "kernels": kernels,
+}
 """Name -> module with ``critic_q`` and ``critic_block``."""
 
 

@@ -139,7 +139,7 @@ class Layout:
             minibatches.terminated,
             next_log_prob,
             dropout.seeds(key, (num_steps, 2, len(config.hidden_sizes))),
-            _bias_corrections(done, num_steps, config.learning_rate),
+            bias_corrections(done, num_steps, config.learning_rate),
         )
         moments = cast(tuple[Params, Params], (state.critic_opt.mu, state.critic_opt.nu))
         trees = (state.critic, state.target_critic, *moments)
@@ -197,7 +197,7 @@ class Layout:
         return q, PackedCritic(kernels=grads[0], vectors=jnp.concatenate(grads[1], axis=1))
 
 
-def _bias_corrections(
+def bias_corrections(
     count: jax.Array, num_steps: int, learning_rate: float
 ) -> tuple[jax.Array, jax.Array]:
     """Return what Adam's bias corrections come to in U steps after ``count``, [U] each.
@@ -217,7 +217,7 @@ def _adam_polyak(
     corrections: tuple[jax.Array, jax.Array],
     tau: float,
 ) -> tuple[PackedCritic, PackedCritic, PackedCritic, PackedCritic]:
-    """Take one Adam step with the two scalars of ``_bias_corrections``, then one Polyak step."""
+    """Take one Adam step with the two scalars of ``bias_corrections``, then one Polyak step."""
     step_size, root_scale = corrections
 
     def move(p: jax.Array, m: jax.Array, n: jax.Array) -> jax.Array:
