@@ -321,22 +321,29 @@ class _Given(NamedTuple):
     """[U, 2]."""
 
 
+def _launch(
+    interpret: bool,
+    step: jax.Array,
+    body: Callable[..., None],
+    grid: tuple[int, ...],
+    args: Sequence[jax.Array],
+    new: Sequence[tuple[int, ...]],
+    in_place: Sequence[jax.Array],
+) -> Any:
+    """Launch a kernel for update ``step`` [1]: its results are new arrays, then those in place."""
+    shapes = [*new, *(x.shape for x in in_place)]
+    return pl.pallas_call(
+        body,
+        grid=grid,
+        out_shape=[jax.ShapeDtypeStruct(shape, jnp.float32) for shape in shapes],
+        input_output_aliases={1 + len(args) + i: len(new) + i for i in range(len(in_place))},
+        interpret=interpret,
+    )(step, *args, *in_place)
+
+
 def _update(plan: _Plan, given: _Given, interpret: bool, step: jax.Array, now: _Moving) -> _Moving:
     """Take update number ``step``: 3 L + 1 launches."""
-
-    def call(body: Callable[..., None], grid: tuple[int, ...], args: Sequence[jax.Array],
-             new: Sequence[tuple[int, ...]], in_place: Sequence[jax.Array]) -> Any:  # fmt: skip
-        """Launch a kernel whose results are new arrays, then its last arguments in place."""
-        args = (jnp.full(1, step, jnp.int32), *args)
-        shapes = [*new, *(x.shape for x in in_place)]
-        return pl.pallas_call(
-            body,
-            grid=grid,
-            out_shape=[jax.ShapeDtypeStruct(shape, jnp.float32) for shape in shapes],
-            input_output_aliases={len(args) + i: len(new) + i for i in range(len(in_place))},
-            interpret=interpret,
-        )(*args, *in_place)
-
+    call = functools.partial(_launch, interpret, jnp.full(1, step, jnp.int32))
     critics, rows, layers = plan.critics, plan.rows, range(len(plan.sizes))
     acts, x, q = [], given.inputs, now.q
     for layer in layers:
