@@ -34,4 +34,4 @@ def transitions() -> Callable[..., Transition]:
 @pytest.fixture
 def small_config() -> DroqConfig:
     """A learner of two small critics with enough dropout to matter in every step."""
-    return DroqConfig(hidden_sizes=(32, 16), batch_size=8, dropout_rate=0.25, learning_rate=1e-2)
+    return DroqConfig(hidden_sizes=(32, 16), batch_size=16, dropout_rate=0.25, learning_rate=1e-2)

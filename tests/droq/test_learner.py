@@ -27,6 +27,12 @@ METRICS = {
     "temperature_loss",
 }
 
+EVERY_FORM = pytest.mark.parametrize(
+    # Compiling interpreted kernels takes long, and test_fast.py compares their blocks.
+    "form",
+    [pytest.param(form, marks=[pytest.mark.slow] * (form == "kernels")) for form in FORMS],
+)
+
 # One jitted function per form, shared by the tests, so that equal shapes compile once.
 update = jax.jit(learner.update, static_argnums=1)
 blocks = {name: jax.jit(form.critic_block, static_argnums=3) for name, form in FORMS.items()}
@@ -51,7 +57,7 @@ def largest_change(new, old):
     return jax.tree.map(lambda a, b: float(jnp.abs(a - b).max()), new, old)
 
 
-@pytest.mark.parametrize("form", FORMS)
+@EVERY_FORM
 def test_update_is_u_critic_steps_then_one_actor_and_temperature_step(
     state, small_config, transitions, form
 ):
@@ -97,7 +103,24 @@ def test_update_is_u_critic_steps_then_one_actor_and_temperature_step(
     np.testing.assert_allclose(metrics["temperature_loss"], surplus, rtol=1e-4)
 
 
-@pytest.mark.parametrize("form", FORMS)
+def test_actor_and_temperature_wait_for_the_critics(state, small_config, transitions):
+    """With a delay of 2 U updates the third block is the first to move them, as if it began."""
+    config = dataclasses.replace(small_config, actor_delay=2 * U)
+    batch = transitions(jax.random.key(1), U, config.batch_size)
+    current = state
+    for i in range(3):
+        new, metrics = update(current, config, batch, jax.random.key(i))
+        moves = i == 2
+        for part in ("actor", "actor_opt", "log_temperature", "temperature_opt"):
+            change = jax.tree.leaves(largest_change(getattr(new, part), getattr(current, part)))
+            assert (min(change) > 0) if moves else (max(change) == 0), (i, part)
+        assert min(jax.tree.leaves(largest_change(new.critic, current.critic))) > 0
+        assert int(new.actor_opt.count) == moves
+        assert np.isfinite(metrics["actor_loss"])
+        current = new
+
+
+@EVERY_FORM
 def test_counters_types_and_metrics(state, small_config, transitions, count_traces, form):
     config = in_form(small_config, form)
     counter = count_traces(learner.update)
@@ -119,7 +142,7 @@ def test_counters_types_and_metrics(state, small_config, transitions, count_trac
     assert min(jax.tree.leaves(largest_change(new.actor, state.actor))) > 0
 
 
-@pytest.mark.parametrize("form", FORMS)
+@EVERY_FORM
 def test_target_moves_by_tau_after_the_critic(state, one_step_config, transitions, form):
     config = one_step_config
     old = CriticState(state.critic, jax.tree.map(lambda x: x + 1.0, state.critic), state.critic_opt)
@@ -152,7 +175,7 @@ def test_dropout_tells_keys_and_critics_apart(state, small_config, transitions, 
     np.testing.assert_allclose(calm[0], calm[1], rtol=1e-6)
 
 
-@pytest.mark.parametrize("form", FORMS)
+@EVERY_FORM
 def test_dropout_is_active_in_online_target_and_actor_losses(
     state, one_step_config, transitions, form
 ):
