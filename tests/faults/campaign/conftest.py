@@ -35,7 +35,7 @@ TIMED = ("wall_s", "env_steps_per_s", "updates_per_s", "compile_s")
 COLUMNS = ("survived equal", "refused clearly", "fell short")
 
 
-MOST = int(os.environ.get("TWIRL_FAULTS", "40"))
+MOST = int(os.environ.get("TWIRL_FAULTS", "20"))
 """Points that are tried of each kind of fault."""
 
 
