@@ -9,7 +9,7 @@ import pytest
 import scipy.stats
 
 from twirl_mjx.replay import ring as ring_lib
-from twirl_mjx.replay.mixed import MixedReplay, sample, source_rows
+from twirl_mjx.replay.mixed import MixedReplay, sample, sample_counted, source_rows
 
 SOURCE_START = 1000
 """Ids of source rows start here, ids of online rows at 0."""
@@ -32,6 +32,33 @@ def test_exact_share_in_every_minibatch(replay, transition_code, phi, batch_size
     ids = decode(batch)
     assert ids.shape == (6, batch_size)
     np.testing.assert_array_equal((ids >= SOURCE_START).sum(1), round(phi * batch_size))
+
+
+def test_a_count_that_is_data_draws_what_the_same_share_draws(replay, transition_code):
+    """Row for row: exact counts, source rows first, none from the wrong ring."""
+    _, decode = transition_code
+    sizes = {"num_minibatches": 5, "batch_size": 8}
+    counted = jax.jit(lambda n: sample_counted(replay, jax.random.key(3), num_source=n, **sizes))
+    for rows in (0, 3, 8):
+        ids = decode(counted(jnp.int32(rows)))
+        np.testing.assert_array_equal((ids >= SOURCE_START).sum(1), rows)
+        fixed = sample(replay, jax.random.key(3), phi=rows / 8, **sizes)
+        np.testing.assert_array_equal(ids, decode(fixed))
+
+
+def test_counts_may_differ_within_a_batch(replay, transition_code):
+    _, decode = transition_code
+    sizes = {"num_minibatches": 3, "batch_size": 16}
+    keys, counts = jax.random.split(jax.random.key(0), 2), [5, 16]
+
+    def draw(key, count):
+        return sample_counted(replay, key, num_source=count, **sizes)
+
+    batch = jax.jit(jax.vmap(draw))(keys, jnp.asarray(counts))
+    for index, count in enumerate(counts):
+        alone = sample(replay, keys[index], phi=count / 16, **sizes)
+        found = decode(jax.tree.map(lambda leaf, i=index: leaf[i], batch))
+        np.testing.assert_array_equal(found, decode(alone))
 
 
 def test_paper_numbers():
@@ -100,3 +127,5 @@ def test_bad_requests_are_refused_with_the_numbers(replay, transition_code):
     other = ring_lib.from_transitions(encode(np.arange(3), obs_size=4))
     with pytest.raises(ValueError, match=r"\(4, 2\).*\(3, 2\)"):
         sample(MixedReplay(other, replay.online), key, phi=0.5, **kwargs)
+    with pytest.raises(ValueError, match="needs a source ring"):
+        sample_counted(MixedReplay(None, replay.online), key, num_source=jnp.int32(4), **kwargs)

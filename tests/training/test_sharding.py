@@ -100,7 +100,7 @@ PROGRAM = """
         chosen = ["--name", f"run{count}", "--seeds", *map(str, range(count))]
         for total in ("128", "256"):  # the second call resumes
             assert cli.main([*words.split(), *chosen, "--total-env-steps", total]) == 0
-    assert [Program(config, count).idle_devices for count in (1, 2)] == [None, None]
+    assert [Program([config] * count).idle_devices for count in (1, 2)] == [None, None]
     print("the same")
 """
 

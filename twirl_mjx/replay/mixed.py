@@ -78,6 +78,56 @@ def sample(
     return ring_lib.unpack(rows, replay.online.obs_size, replay.online.action_size)
 
 
+def sample_counted(
+    replay: MixedReplay,
+    key: jax.Array,
+    *,
+    num_minibatches: int,
+    batch_size: int,
+    num_source: jax.Array,
+) -> Transition:
+    """Draw what :func:`sample` draws, with the number of source rows as data.
+
+    A run whose share moves, and runs of one program whose shares differ, cannot have it in the
+    shapes. The same key draws the same rows as there; each position reads both rings, and one that
+    does not count reads a single row again and again, which stays in the cache.
+
+    Args:
+        replay: Both rings.
+        key: Random key.
+        num_minibatches: U.
+        batch_size: B.
+        num_source: [] int32 in [0, B], rows of every minibatch from the source. A side that then
+            contributes a row must hold at least one.
+
+    Returns:
+        Transitions [U, B, ...]; rows [:, :num_source] are from the source.
+
+    Raises:
+        ValueError: If there is no source ring, or the rings store rows of different sizes.
+    """
+    if replay.source is None:
+        raise ValueError("a number of source rows that is data needs a source ring")
+    _check_same_rows(replay.source, replay.online)
+    source_key, online_key = jax.random.split(key)
+    minibatch, position = jnp.arange(num_minibatches)[:, None], jnp.arange(batch_size)
+    is_source = position < num_source
+    num_online = batch_size - num_source
+    # A side draws [U, its rows]: where in that stands the number of each position.
+    source_place = jnp.where(is_source, minibatch * num_source + position, 0)
+    online_place = jnp.where(is_source, 0, minibatch * num_online + position - num_source)
+    sides = []
+    for ring, side_key, at in (
+        (replay.source, source_key, source_place),
+        (replay.online, online_key, online_place),
+    ):
+        shape = (num_minibatches * batch_size,)
+        drawn = jax.random.randint(side_key, shape, 0, ring.size, jnp.int32)
+        sides.append(ring_lib.gather_rows(ring, drawn[at]))
+    rows = jnp.where(is_source[:, None], *sides)
+    return ring_lib.unpack(rows, replay.online.obs_size, replay.online.action_size)
+
+
 def _draw(ring: RingBuffer, key: jax.Array, shape: tuple[int, int], name: str) -> jax.Array:
     """Gather packed rows [*shape, W] uniformly from the filled part of a ring."""
     if not isinstance(ring.size, jax.core.Tracer) and int(ring.size) < 1:

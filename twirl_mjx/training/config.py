@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 from twirl_mjx.checks import check_choice, check_range
 from twirl_mjx.droq.config import DroqConfig
-from twirl_mjx.replay.config import ReplayConfig
+from twirl_mjx.replay.config import AUTO, Phi, ReplayConfig
 from twirl_mjx.tasks.registry import TASKS
 from twirl_mjx.training.learners import DROQ, LEARNERS, settings_of
 from twirl_mjx.worlds.config import WorldConfig, world_fields
@@ -124,6 +124,11 @@ class TrainConfig(WorldConfig):
         per_epoch = self.steps_per_epoch * self.num_envs
         check_range("total_env_steps", self.total_env_steps, 1, countable - per_epoch)
         check_source_rows(self.effective_phi, self.droq.batch_size)
+        if self.replay.phi == AUTO and not self.uses_source_data:
+            raise ValueError(
+                f"replay.phi auto chooses a share of source rows, and variant {self.variant} has"
+                " none (nearest: variant 'twirl')"
+            )
         if self.replay.capacity < self.num_envs:
             raise ValueError(
                 f"replay.capacity {self.replay.capacity} is below num_envs {self.num_envs}"
@@ -147,7 +152,7 @@ class TrainConfig(WorldConfig):
     @property
     def uses_source_data(self) -> bool:
         """Whether minibatches hold source rows."""
-        return self.variant in ("twirl", "twirl+weights") and self.effective_phi > 0.0
+        return self.effective_phi != 0.0
 
     @property
     def uses_source_weights(self) -> bool:
@@ -155,7 +160,7 @@ class TrainConfig(WorldConfig):
         return self.variant in ("weights", "twirl+weights")
 
     @property
-    def effective_phi(self) -> float:
+    def effective_phi(self) -> Phi:
         """Phi of this variant: 0 unless it trains on source data."""
         return self.replay.phi if self.variant in ("twirl", "twirl+weights") else 0.0
 
@@ -172,12 +177,28 @@ class TrainConfig(WorldConfig):
         )
 
 
-def check_source_rows(phi: float, batch_size: int) -> None:
+def of_program(config: TrainConfig) -> TrainConfig:
+    """Return a config without what the runs of one program may differ in.
+
+    That is the seed, phi, and where the source is, which each run has for itself.
+    """
+    replay = dataclasses.replace(config.replay, phi=0.0)
+    return dataclasses.replace(config, seed=0, source="auto", replay=replay)
+
+
+def check_source_rows(phi: Phi, batch_size: int) -> None:
     """Check that a minibatch holds a row of each side that ``phi`` asks for.
 
     Raises:
         ValueError: ``phi`` rounds to none, or to all; the message has the nearest that does not.
     """
+    if isinstance(phi, str):
+        if batch_size < 2:
+            raise ValueError(
+                f"replay.phi {phi} needs a row of each side in a minibatch, and droq.batch_size is"
+                f" {batch_size} (nearest: 2)"
+            )
+        return
     rows = round(phi * batch_size)
     if phi in (0.0, 1.0) or 0 < rows < batch_size:
         return

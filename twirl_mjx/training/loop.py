@@ -20,6 +20,7 @@ from twirl_mjx.policies.learned import NumpyPolicy, load_policy
 from twirl_mjx.tasks.measures import episode_means
 from twirl_mjx.training import program
 from twirl_mjx.training.checkpoint import stored_steps
+from twirl_mjx.training.config import of_program
 from twirl_mjx.training.guards import DivergedError, check_experience, check_finite
 from twirl_mjx.training.learner_check import check_learner
 from twirl_mjx.training.logger import RunLogger
@@ -44,33 +45,33 @@ class Outcome:
     """Mean measures of the closing evaluation of the best policy; empty unless finished."""
 
 
-def common_step(run_dirs: Mapping[int, RunDir]) -> int | None:
+def common_step(run_dirs: Sequence[RunDir]) -> int | None:
     """Return the newest checkpoint that all runs have; None when none has any.
 
     A batch that was killed while it saved has written the checkpoint of some seeds and not of
     others: all of them go on from the one before.
 
     Args:
-        run_dirs: Directories of the runs, by seed.
+        run_dirs: Directories of the runs.
 
     Raises:
         ValueError: They have checkpoints, and none in common.
     """
-    stored = {seed: stored_steps(run_dir.path) for seed, run_dir in run_dirs.items()}
+    stored = {run_dir: stored_steps(run_dir.path) for run_dir in run_dirs}
     if not any(stored.values()):
         return None
     common = set.intersection(*map(set, stored.values()))
     if common:
         return max(common)
-    groups: dict[int, list[int]] = {}
-    for seed, steps in stored.items():
-        groups.setdefault(max(steps, default=0), []).append(seed)
+    groups: dict[int, list[str]] = {}
+    for run_dir, steps in stored.items():
+        groups.setdefault(max(steps, default=0), []).append(run_dir.name)
     told = ", ".join(
-        f"--seeds {' '.join(map(str, seeds))} ({f'at {step:,}' if step else 'without any'})"
-        for step, seeds in sorted(groups.items())
+        f"{' '.join(names)} ({f'at {step:,}' if step else 'without any'})"
+        for step, names in sorted(groups.items())
     )
     raise ValueError(
-        "one program trains seeds that are equally far, and these have no checkpoint in common;"
+        "one program trains runs that are equally far, and these have no checkpoint in common;"
         f" nothing was touched. Train them in groups: {told}"
     )
 
@@ -82,7 +83,7 @@ class Batch:
         """Build (not compile) everything.
 
         Args:
-            parts: S seeds whose configs differ in nothing else.
+            parts: S runs that differ in seed, phi and source only.
             stage: Name shown with the progress.
             deadline: ``time.monotonic()`` after which no epoch is begun.
 
@@ -91,13 +92,14 @@ class Batch:
                 configs differ.
         """
         config = parts[0].config
-        if any(dataclasses.replace(part.config, seed=config.seed) != config for part in parts):
-            raise ValueError("the runs of one program must differ in nothing but their seeds")
+        if any(of_program(part.config) != of_program(config) for part in parts):
+            raise ValueError("the runs of one program must differ in nothing but seed and phi")
         self.config = config
         self._parts = parts
         self._deadline = deadline
-        own = any(part.source is not parts[0].source for part in parts)
-        self.program = Program(config, len(parts), own_sources=own)
+        rings = [part.source for part in parts if part.source is not None]
+        own = any(ring is not rings[0] for ring in rings)
+        self.program = Program([part.config for part in parts], own_sources=own)
         env = self.program.env
         check_learner(config.droq, env.observation_size, env.action_size)
         self.runs = [Run(part, env, stage) for part in parts]
@@ -128,9 +130,9 @@ class Batch:
         Raises:
             ValueError: The seeds have checkpoints, and none in common.
         """
-        step = common_step({run.config.seed: run.run_dir for run in self.runs})
+        step = common_step([run.run_dir for run in self.runs])
         if step is None:
-            states = self.program.init([run.config.seed for run in self.runs])
+            states = self.program.init()
             if any(part.initial for part in self._parts):
                 fresh = program.split(states.learner, len(self.runs))
                 begun = [
@@ -145,14 +147,17 @@ class Batch:
 
     def _restore(self, step: int) -> list[TrainState]:
         """Return the checkpoints of all seeds at ``step``, or before it where one is damaged."""
-        template = self.program.template()
+        templates = [self.program.template(index) for index in range(len(self.runs))]
         while True:
-            states = [run.restore(template, step) for run in self.runs]
+            states = [
+                run.restore(template, step)
+                for run, template in zip(self.runs, templates, strict=True)
+            ]
             reached = {int(state.env_steps) for state in states}
             if len(reached) == 1:
                 return states
             # Damaged ones have been deleted: the others go back to what is left in common.
-            found = common_step({run.config.seed: run.run_dir for run in self.runs})
+            found = common_step([run.run_dir for run in self.runs])
             assert found is not None, "every seed has restored one"
             step = found
 

@@ -36,6 +36,10 @@ METRICS: dict[str, MetricInfo] = {
     "replay_ratio": MetricInfo("replayed rows per transition, utd * batch size", "1"),
     "source_rows": MetricInfo("filled rows of the source ring", "1"),
     "online_rows": MetricInfo("filled rows of the online ring", "1"),
+    # Of a run whose phi chooses itself (replay/share.py).
+    "phi": MetricInfo("share of source rows in the minibatches of the epoch", "share"),
+    "source_worth": MetricInfo("what an episode of the source data earns, as phi is chosen by", "1"),
+    "online_worth": MetricInfo("the same of the last epochs' transitions", "1"),
     "compile_s": MetricInfo("time spent compiling (and running once) in the epoch", "s"),
 }
 """What training itself reports; a task adds its measures, a learner its ``metrics``."""

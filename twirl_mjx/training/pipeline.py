@@ -258,7 +258,7 @@ def _train(members: list[Member], say: Say, deadline: float) -> None:
             assert member.source is not None, "zero-shot has a source"
             zero_shot(member.config, member.run_dir, member.source, say)
         return
-    begun = loop.common_step({member.config.seed: member.run_dir for member in members})
+    begun = loop.common_step([member.run_dir for member in members])
     rings: dict[str, ring.RingBuffer] = {}
     parts = []
     for member in members:

@@ -14,7 +14,10 @@ import jax
 import numpy as np
 
 from twirl_mjx.evaluation.rollout import ActFn, first_episodes, make_evaluate
+from twirl_mjx.replay import share as share_lib
+from twirl_mjx.replay.config import AUTO
 from twirl_mjx.replay.ring import RingBuffer
+from twirl_mjx.replay.share import Share
 from twirl_mjx.training import seeds as batch
 from twirl_mjx.training import sharding
 from twirl_mjx.training import state as single
@@ -84,18 +87,19 @@ def compile_evaluation(
 class Program:
     """Everything that is compiled to train S seeds of one config."""
 
-    def __init__(self, config: TrainConfig, num_seeds: int, *, own_sources: bool = False) -> None:
+    def __init__(self, configs: Sequence[TrainConfig], *, own_sources: bool = False) -> None:
         """Build (not compile) the functions.
 
         Args:
-            config: The run; its seed does not matter.
-            num_seeds: S.
+            configs: S runs that are alike (``config.of_program``).
             own_sources: Whether every seed has a source ring of its own.
         """
-        self.num_seeds = num_seeds
+        config = configs[0]
+        self.num_seeds = len(configs)
         self.env = make_env(config)
-        self.evaluate = compile_evaluation(config, num_seeds)
-        self._config = config
+        self.evaluate = compile_evaluation(config, self.num_seeds)
+        self._configs = configs
+        self._counts_differ = len({each.effective_phi for each in configs}) > 1
         self._own_sources = own_sources
         self.idle_devices: str | None = None
         """Why devices that are there are not used, as a line."""
@@ -103,7 +107,7 @@ class Program:
 
     def _compile(self) -> tuple[sharding.Epoch, sharding.Place]:
         """Return the epoch and what puts a state where it runs: seeds or worlds on all devices."""
-        config, env, own = self._config, self.env, self._own_sources
+        config, env, own = self._configs[0], self.env, self._own_sources
         alone = self.num_seeds == 1
         if (devices := jax.device_count()) > 1:
             what = ("num_envs", env.num_envs) if alone else ("seeds", self.num_seeds)
@@ -120,34 +124,57 @@ class Program:
             return single.compile_epoch(config, env), lambda state: state
         return batch.compile_epoch_seeds(config, env, own_sources=own), lambda states: states
 
-    def init(self, seeds: Sequence[int]) -> TrainState:
-        """Return the states of S seeds before the first transition, without source rings."""
+    def init(self) -> TrainState:
+        """Return the states of all seeds before the first transition, without source rings."""
+        config, env = self._configs[0], self.env
         if self.num_seeds == 1:
-            return jax.jit(self._fresh)(jax.random.key(seeds[0]))
-        return batch.init_seeds(self._config, self.env, seeds, None)
+            return jax.jit(lambda key: single.init(config, env, key, None))(
+                jax.random.key(config.seed)
+            )
+        states = batch.init_seeds(config, env, [each.seed for each in self._configs], None)
+        return states.replace(share=join([self._share(each) for each in self._configs]))
 
-    def template(self) -> TrainState:
-        """Return shapes and dtypes of the state of one seed."""
-        return jax.eval_shape(self._fresh, jax.random.key(0))
+    def _share(self, config: TrainConfig) -> Share | None:
+        """Return the share of a seed before its first epoch, where it is data."""
+        if self._counts_differ or config.effective_phi == AUTO:
+            return share_lib.init(config.effective_phi, config.droq.batch_size)
+        return None
 
-    def _fresh(self, key: jax.Array) -> TrainState:
-        return single.init(self._config, self.env, key, None)
+    def template(self, index: int) -> TrainState:
+        """Return shapes and dtypes of the state of one seed, as it is alone."""
+        config, env = self._configs[index], self.env
+        return jax.eval_shape(lambda key: single.init(config, env, key, None), jax.random.key(0))
 
     def stack(self, states: Sequence[TrainState]) -> TrainState:
-        """Return the states of S seeds as one.
+        """Return the states of S seeds, each as it is alone, as one.
 
         Raises:
             ValueError: They are not equally far.
         """
-        return states[0] if self.num_seeds == 1 else batch.stack_states(states)
+        if self.num_seeds == 1:
+            return states[0]
+        return batch.stack_states(
+            [
+                state if state.share is not None else state.replace(share=self._share(config))
+                for state, config in zip(states, self._configs, strict=True)
+            ]
+        )
 
     def seed_state(self, states: TrainState, index: int) -> TrainState:
-        """Return the state of one seed of the batch, for a checkpoint."""
-        return states if self.num_seeds == 1 else batch.seed_state(states, index)
+        """Return the state of one seed of the batch as it is alone, for a checkpoint."""
+        if self.num_seeds == 1:
+            return states
+        state = batch.seed_state(states, index)
+        is_auto = self._configs[index].effective_phi == AUTO
+        return state if is_auto else state.replace(share=None)
 
     def place(self, states: TrainState, sources: Sequence[RingBuffer | None]) -> TrainState:
-        """Return the states where they are trained, with their source rings or the shared one."""
-        given = [source for source in sources if source is not None]
-        own = self._own_sources and self.num_seeds > 1
-        source = batch.stack_rings(given) if own else sources[0]
+        """Return the states where they are trained, with their source rings or the shared one.
+
+        A seed without a source (phi 0) beside others draws no row of the ring it is given.
+        """
+        first = next((source for source in sources if source is not None), None)
+        source = first
+        if self._own_sources and first is not None:
+            source = batch.stack_rings([first if ring is None else ring for ring in sources])
         return self._place(states.replace(replay=states.replay.replace(source=source)))

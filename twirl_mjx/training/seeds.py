@@ -42,6 +42,7 @@ def per_field(batched: Any, shared: Any, *, own_sources: bool = False) -> Any:
         key=batched,
         env_steps=shared,
         inserted=batched,
+        share=batched,
     )
 
 
@@ -57,17 +58,17 @@ def init_seeds(
     Args:
         config: The run; its ``seed`` is not used.
         env: Its worlds; every seed has ``env.num_envs`` of its own.
-        seeds: S different seeds.
+        seeds: S seeds; one may occur again where runs differ in phi.
         source: Frozen source experience that all seeds share, or None.
 
     Returns:
         A state with a leading axis [S] on every leaf but those of ``AXES`` without one.
 
     Raises:
-        ValueError: No seed, or one that occurs twice.
+        ValueError: No seed.
     """
-    if not seeds or len(set(seeds)) != len(seeds):
-        raise ValueError(f"seeds {list(seeds)} must be at least one, all different")
+    if not seeds:
+        raise ValueError("a batch needs at least one seed")
     keys = jax.vmap(jax.random.key)(jnp.asarray(seeds, jnp.uint32))
 
     def fresh(key: jax.Array) -> TrainState:

@@ -143,6 +143,7 @@ def _world_specs() -> TrainState:
         key=everywhere,
         env_steps=everywhere,
         inserted=everywhere,
+        share=everywhere,
     )
 
 

@@ -11,13 +11,15 @@ import jax
 import jax.numpy as jnp
 
 from twirl_mjx.replay import mixed, ring
+from twirl_mjx.replay import share as share_lib
+from twirl_mjx.replay.config import AUTO
 from twirl_mjx.replay.mixed import MixedReplay
 from twirl_mjx.tasks import measures
 from twirl_mjx.tasks.measures import Tracker
 from twirl_mjx.training.config import TrainConfig
 from twirl_mjx.training.learners import learner_of
 from twirl_mjx.training.metrics import FIRST_DROP
-from twirl_mjx.types import Metrics
+from twirl_mjx.types import Metrics, Transition
 from twirl_mjx.worlds.vector import EnvState, VectorEnv, make_transition
 
 
@@ -38,6 +40,8 @@ class TrainState(flax.struct.PyTreeNode):
     """int32, transitions gathered (dropped ones included)."""
     inserted: jax.Array
     """int32, transitions inserted in the online ring, dropped ones excluded."""
+    share: share_lib.Share | None = None
+    """Source rows of a minibatch, where they are data; None: phi is a number when compiled."""
 
 
 class EpisodeSums(flax.struct.PyTreeNode):
@@ -75,6 +79,9 @@ def init(
         key=key,
         env_steps=jnp.zeros((), jnp.int32),
         inserted=jnp.zeros((), jnp.int32),
+        share=(
+            share_lib.init(AUTO, config.droq.batch_size) if config.effective_phi == AUTO else None
+        ),
     )
 
 
@@ -108,6 +115,19 @@ def collect_step(
     return state, result, fault
 
 
+def draw(config: TrainConfig, state: TrainState, key: jax.Array) -> Transition:
+    """Draw the minibatches [U, B, ...] of a block of updates."""
+    sizes = {
+        "num_minibatches": config.droq.updates_per_block,
+        "batch_size": config.droq.batch_size,
+    }
+    phi = config.effective_phi
+    if state.share is not None:
+        return mixed.sample_counted(state.replay, key, num_source=state.share.num_source, **sizes)
+    assert not isinstance(phi, str), "phi that chooses itself is data"
+    return mixed.sample(state.replay, key, phi=phi, **sizes)
+
+
 def update_blocks(config: TrainConfig, state: TrainState, key: jax.Array) -> tuple[Any, Metrics]:
     """Run all blocks of critic updates that follow one vector step; none during warm-up.
 
@@ -120,13 +140,7 @@ def update_blocks(config: TrainConfig, state: TrainState, key: jax.Array) -> tup
 
     def block(learner: Any, block_key: jax.Array) -> tuple[Any, Metrics]:
         sample_key, update_key = jax.random.split(block_key)
-        minibatches = mixed.sample(
-            state.replay,
-            sample_key,
-            num_minibatches=config.droq.updates_per_block,
-            batch_size=config.droq.batch_size,
-            phi=config.effective_phi,
-        )
+        minibatches = draw(config, state, sample_key)
         return learner_of(config.droq).update(learner, config.droq, minibatches, update_key)
 
     def body(i: jax.Array, carry: tuple[Any, Metrics]) -> tuple[Any, Metrics]:
@@ -192,6 +206,18 @@ def train_epoch(
         "episodes": episodes,
         "online_rows": state.replay.online.size.astype(jnp.float32),
     }
+    if state.share is not None:
+        assert state.replay.source is not None, "a share of source rows has a source ring"
+        gathered = config.steps_per_epoch * env.num_envs
+        moved, told = share_lib.move(
+            state.share,
+            state.replay.source,
+            metrics["reward"],
+            jnp.sum(finished.values["terminated"]) / gathered,
+            batch_size=config.droq.batch_size,
+            episode_length=env.episode_length,
+        )
+        state, metrics = state.replace(share=moved), metrics | told
     return state, metrics
 
 

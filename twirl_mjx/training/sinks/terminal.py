@@ -23,6 +23,7 @@ TRAINING = {
     "updates_per_s": ("updates/s", "{:.0f}"),
     "return": ("return", "{:.1f}"),
     "episode_length": ("length", "{:.0f}"),
+    "phi": ("phi", "{:.2f}"),
 }
 """Headlines before those of the task: label and format."""
 RETURN = {"eval/return": ("eval return", "{:.1f}")}
