@@ -23,7 +23,7 @@ from twirl_mjx.policies.onnx_file import load_onnx
 from twirl_mjx.policies.resolve import Terms, resolve_policy
 from twirl_mjx.sim.robots import A1
 from twirl_mjx.training.presets import make_config
-from twirl_mjx.training.source import collect
+from twirl_mjx.training.source import Collector
 from twirl_mjx.worlds.make import make_env
 from twirl_mjx.worlds.vector import VectorEnv
 
@@ -186,7 +186,7 @@ def test_a_recurrent_graph_keeps_a_memory_for_every_world(
         np.testing.assert_array_equal(actions[0][2], actions[2][2])  # always fresh
         assert np.abs(actions[0][0] - actions[1][0]).max() > 1e-4
     np.testing.assert_allclose(found[0], found[1], atol=1e-6)
-    data, _ = collect(env, source.policy, KEY, 8)
+    data, _ = Collector(env, source.policy)(KEY, 8)
     assert data.obs.shape == (8, 101)
     with pytest.raises(ValueError, match="keeps a memory or a clock"):
         load_onnx(one).act(np.zeros(48))
@@ -284,8 +284,8 @@ def test_clipping_is_counted_and_refused(
     far = np.where(np.arange(12) < 3, 10.0, 0.1)
     policy = meet(GO1, Brain(lambda o, t, m: (jnp.tile(jnp.float32(far), (2, 1)), m), None, 48))
     with pytest.raises(ValueError, match=r"25% of the source's joint targets.*--allow-clipping"):
-        collect(env, policy, KEY, 8, max_clipped=0.2)
-    data, means = collect(env, policy, KEY, 8)
+        Collector(env, policy)(KEY, 8, max_clipped=0.2)
+    data, means = Collector(env, policy)(KEY, 8)
     assert means["clipped"] == pytest.approx(0.25)
     assert np.abs(data.action).max() == 1.0
 

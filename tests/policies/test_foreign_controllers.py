@@ -16,7 +16,7 @@ from twirl_mjx.policies.ready import GO1_JOYSTICK
 from twirl_mjx.policies.resolve import Terms, resolve_policy
 from twirl_mjx.sim.robots import A1
 from twirl_mjx.training.presets import make_config
-from twirl_mjx.training.source import collect
+from twirl_mjx.training.source import Collector
 from twirl_mjx.worlds.make import make_env
 
 KEY = jax.random.key(0)
@@ -33,7 +33,7 @@ def test_the_joystick_trot_becomes_source_data(
     path = graphs.trot(tmp_path / "a1.onnx")
     config = dataclasses.replace(make_config(task, "debug").evaluation, engine="native")
     source = resolve_policy(str(path), config, terms=Terms("legged_gym_48", "0.7,0,0"))
-    data, means = collect(make_env(config, num_envs=2), source.policy, KEY, 60, max_clipped=0.2)
+    data, means = Collector(make_env(config, num_envs=2), source.policy)(KEY, 60, max_clipped=0.2)
     assert data.obs.shape == (60, {"biped": 101, "hurdles": 95}[task])
     assert "clipped" not in means
     assert "20 Hz" in source.notes[1]

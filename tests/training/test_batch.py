@@ -20,7 +20,7 @@ from rich.console import Console
 import twirl_mjx
 from twirl_mjx import cli, exits
 from twirl_mjx.replay import dataset, mixed, ring
-from twirl_mjx.training import loop, pipeline, seeds
+from twirl_mjx.training import collection, loop, pipeline, seeds
 from twirl_mjx.training.checkpoint import Checkpoints, stored_steps
 from twirl_mjx.training.config import TrainConfig
 from twirl_mjx.training.guards import DivergedError
@@ -274,7 +274,7 @@ def test_the_command_line_names_and_sources_every_seed(
         other = RunDir(tmp_path / f"collected-s{seed}")
         other.path.mkdir()
         source = pipeline.find_source(config, "debug", tmp_path, print)
-        pipeline.source_data(config, other, source, print)
+        collection.source_data(config, other, source, print)
         a, b = (
             dataset.read(d.dataset, task="biped", observation_size=101, action_size=12)[1]
             for d in (run_dir, other)

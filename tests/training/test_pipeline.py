@@ -18,12 +18,12 @@ from twirl_mjx.droq import learner as droq
 from twirl_mjx.policies.learned import load_policy
 from twirl_mjx.policies.resolve import Source, resolve_policy
 from twirl_mjx.replay import dataset
-from twirl_mjx.training import pipeline, rundir, weights
+from twirl_mjx.training import collection, pipeline, rundir, weights
 from twirl_mjx.training.checkpoint import load_learner, load_replay
 from twirl_mjx.training.config import TrainConfig
 from twirl_mjx.training.presets import make_config
 from twirl_mjx.training.rundir import RunDir
-from twirl_mjx.training.source import collect
+from twirl_mjx.training.source import Collector
 from twirl_mjx.worlds.make import make_env
 
 NOMINAL = "biped-twirl-debug-s0"
@@ -62,12 +62,12 @@ def test_collected_data_are_used_again_until_settings_change(
     said: list[str] = []
     config = dataclasses.replace(biped, source="trot")
     source = pipeline.find_source(config, "debug", runs, said.append)
-    pipeline.source_data(config, RunDir(runs / NOMINAL), source, said.append)
+    collection.source_data(config, RunDir(runs / NOMINAL), source, said.append)
     assert any("source.npz" in line for line in said)
     assert not any("collecting" in line for line in said)
     other = dataclasses.replace(source, digest="another policy")
-    digest = pipeline.collection_digest(config, other)
-    assert digest != pipeline.collection_digest(config, source)
+    digest = collection.collection_digest(config, other)
+    assert digest != collection.collection_digest(config, source)
 
 
 @pytest.mark.parametrize(
@@ -147,8 +147,8 @@ def test_onnx_source_acts_like_the_policy_it_came_from(
     onnx = export_onnx(run_dir, tmp_path / "policy.onnx")
     env = make_env(biped.evaluation, num_envs=2)
     key = jax.random.key(4)
-    learned, _ = collect(env, resolve_policy(str(run_dir), biped).policy, key, 12)
-    hosted, _ = collect(env, resolve_policy(str(onnx), biped).policy, key, 12)
+    learned, _ = Collector(env, resolve_policy(str(run_dir), biped).policy)(key, 12)
+    hosted, _ = Collector(env, resolve_policy(str(onnx), biped).policy)(key, 12)
     np.testing.assert_allclose(hosted.action, learned.action, atol=1e-4)
     assert learned.reward.shape == (12,)
 
@@ -281,32 +281,33 @@ def test_a_nominal_run_of_another_preset_is_not_taken(biped: TrainConfig, runs: 
         pipeline.find_source(cpu, "cpu", runs, print)
 
 
-def test_source_data_hold_whole_episodes(
-    biped: TrainConfig, runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_source_data_hold_whole_episodes_and_one_program_collects_for_all_seeds(
+    biped: TrainConfig, runs: Path, tmp_path: Path
 ) -> None:
-    worlds: list[int] = []
-
-    def few(env, policy, key, size, **words):  # type: ignore[no-untyped-def]
-        worlds.append(env.num_envs)
-        return collect(env, policy, key, size, **words)
-
-    monkeypatch.setattr(pipeline, "collect", few)
     crowd = dataclasses.replace(biped, num_envs=64)
     config = dataclasses.replace(crowd, source="trot")
     source = pipeline.find_source(config, "debug", runs, print)
-    pipeline.write_dataset(config, source, tmp_path / "source.npz", "digest", print)
-    assert worlds == [biped.replay.source_size // biped.eval.episode_length]
+    collectors: collection.Collectors = {}
+    rewards = []
+    for seed in (0, 1):
+        path, other = tmp_path / f"source{seed}.npz", dataclasses.replace(config, seed=seed)
+        data = collection.write_dataset(other, source, path, "digest", print, collectors)
+        rewards.append(data.reward)
+    (collector,) = collectors.values()
+    assert collector.env.num_envs == biped.replay.source_size // biped.eval.episode_length
+    assert collector._run._cache_size() == 1
+    assert not np.array_equal(*rewards)
 
 
 def test_the_engine_does_not_decide_what_is_collected(biped: TrainConfig, runs: Path) -> None:
     config = dataclasses.replace(biped, source="trot")
     source = pipeline.find_source(config, "debug", runs, print)
-    digest = pipeline.collection_digest(config, source)
+    digest = collection.collection_digest(config, source)
     mjx = dataclasses.replace(config, engine="mjx")
-    assert pipeline.collection_digest(mjx, source) == digest
+    assert collection.collection_digest(mjx, source) == digest
     quiet = dataclasses.replace(config.replay, source_noise=False)
     calm = dataclasses.replace(config, replay=quiet)
-    assert pipeline.collection_digest(calm, source) != digest
+    assert collection.collection_digest(calm, source) != digest
 
 
 def test_a_learned_source_is_noisy_only_while_its_data_are_collected(
@@ -335,7 +336,7 @@ def test_the_replay_of_another_task_is_no_source_data(biped: TrainConfig, tmp_pa
     source = Source(None, "a stand run", "digest", run_dir=tmp_path)  # type: ignore[arg-type]
     config = dataclasses.replace(biped, shift="icy")
     with pytest.raises(ValueError, match="is a run of task stand: its replay is no experience"):
-        pipeline.source_data(config, RunDir(tmp_path), source, print)
+        collection.source_data(config, RunDir(tmp_path), source, print)
 
 
 def test_weights_that_cannot_fit_are_refused_before_any_stage(

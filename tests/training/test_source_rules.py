@@ -11,7 +11,7 @@ import pytest
 from twirl_mjx.policies.recorded import RecordedPolicy
 from twirl_mjx.policies.resolve import Source, Terms
 from twirl_mjx.replay import dataset
-from twirl_mjx.training import pipeline, source_rules
+from twirl_mjx.training import collection, pipeline, source_rules
 from twirl_mjx.training.presets import make_config
 from twirl_mjx.training.rundir import Foreign, New, RunDir, RunMismatchError
 from twirl_mjx.training.source_rules import (
@@ -151,7 +151,7 @@ def test_data_that_the_run_did_not_collect_are_not_collected_over(tmp_path: Path
     before = run_dir.dataset.read_bytes()
     source = pipeline.find_source(config, "debug", tmp_path, print)
     with pytest.raises(RunMismatchError, match=r"this run did not collect \(run theirs did"):
-        pipeline.source_data(config, run_dir, source, print)
+        collection.source_data(config, run_dir, source, print)
     assert run_dir.dataset.read_bytes() == before
 
 
@@ -161,7 +161,7 @@ def test_recorded_data_become_the_source_ring(tmp_path: Path) -> None:
     rows = Transition(zeros, zeros[:, :12], zeros[:, 0] + 7.0, zeros[:, 0] > 0, zeros)
     data = Source(RecordedPolicy("d.npz"), "d.npz", "abc", data=rows)
     said: list[str] = []
-    found = pipeline.source_data(config, RunDir(tmp_path / "run"), data, said.append)
+    found = collection.source_data(config, RunDir(tmp_path / "run"), data, said.append)
     assert int(found.size) == 4
     assert "4 recorded transitions" in said[-1]
     assert not (tmp_path / "run").exists()

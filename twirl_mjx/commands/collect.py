@@ -18,7 +18,7 @@ def main(argv: list[str]) -> int:
     """Record a source policy in a target task as ``runs/<name>/source.npz``."""
     options = parse_collect(argv)
     with waiting("loading the trainer"):  # orbax and more, which options do not need
-        from twirl_mjx.training import memory, pipeline, rundir
+        from twirl_mjx.training import collection, memory, pipeline, rundir
         from twirl_mjx.training.sinks.registry import resolve
     config = dataclasses.replace(
         options.config, source=the_one(options.config.source, options.runs)
@@ -36,7 +36,7 @@ def main(argv: list[str]) -> int:
         run_dir.open(config, source.identity)
         path = run_dir.dataset
         before = _version(path)
-        pipeline.source_data(config, run_dir, source, say)
+        collection.source_data(config, run_dir, source, say)
         written = _version(path) != before
     if source.data is not None:
         say(f"nothing was collected: {source.origin} is recorded data, and `twirl train` reads it")

@@ -43,7 +43,8 @@ class CollectOptions:
 class TrainOptions(CollectOptions):
     """Train a task, with every stage before it that is missing.
 
-    The same command resumes.
+    The same command resumes. RUN --and RUN --and ..., each with options of its own, trains runs
+    that differ in --seed, --replay.phi and --source in one program.
     """
 
     seeds: tuple[int, ...] = ()
@@ -64,7 +65,7 @@ def parse_train(argv: list[str]) -> TrainOptions:
     options = _parse(argv, "twirl train", TrainOptions)
     if options.minutes is not None:
         check_range("minutes", options.minutes, 0.001, 1e7)
-    if options.seeds and options.config.seed != TrainConfig.seed:
+    if options.seeds and any(word.partition("=")[0] == "--seed" for word in argv):
         seeds = " ".join(map(str, options.seeds))
         raise ValueError(
             f"--seed {options.config.seed} beside --seeds {seeds}: give one of them (nearest:"

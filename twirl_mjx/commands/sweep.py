@@ -35,7 +35,10 @@ class SweepOptions:
     gather_only: bool = False
     """Only write the tables of what is finished."""
     workers: int | None = None
-    """Most runs at once; one per usable core, or per GPU fraction, by default."""
+    """Most processes at once; one per usable core, or per GPU fraction, by default."""
+    together: int | None = None
+    """Most runs in one process (1: a process for each); by default cells that differ in seed and
+    phi only are one program, divided evenly on the workers."""
     gpus: float | None = None
     """GPUs per run, may be a fraction; one where there are any by default."""
     address: str | None = None
@@ -48,6 +51,8 @@ def main(argv: list[str]) -> int:
     """Sweep; exit status 1 when a cell failed, 130 when stopped by a signal after saving."""
     options = parse(SweepOptions, argv, "twirl sweep")
     check_range("retries", options.retries, 0, 100)
+    if options.together is not None:
+        check_range("together", options.together, 1, 10_000)
     if options.workers is not None:
         check_range("workers", options.workers, 1, 10_000)
     from twirl_mjx.commands.sweep_run import sweep  # needs jax, which options do not

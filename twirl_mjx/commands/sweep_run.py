@@ -17,6 +17,7 @@ from twirl_mjx.sweep import estimate, gather, plan
 from twirl_mjx.sweep.grid import Grid, grids_folder, load
 from twirl_mjx.sweep.scheduler import Progress, RayExecutor, run_all
 from twirl_mjx.sweep.table import SweepView, plan_table
+from twirl_mjx.sweep.together import make_teams
 from twirl_mjx.sweep.worker import Job
 from twirl_mjx.training.signals import stop_on_signal
 from twirl_mjx.training.sinks.terminal import format_seconds
@@ -159,6 +160,7 @@ def _run(
             show=view.update,
             look=look_of(todo, runs),
             say=view.say,
+            teams=make_teams(todo, runs, options.together),
         )
 
 
@@ -179,7 +181,7 @@ def report(table: Mapping[str, Progress]) -> int:
     lost = [p for p in table.values() if p.state in ("failed", "blocked")]
     stopped = [p for p in table.values() if p.state in ("stopped", "waiting", "running", "busy")]
     for progress in lost:
-        say(f"{progress.state}: {progress.job.name}: {progress.reason}; log: {progress.job.log}")
+        say(f"{progress.state}: {progress.job.name}: {progress.reason}; log: {progress.log}")
     if stopped:
         say(f"stopped with {len(stopped)} runs to do; the same command goes on")
         return 130

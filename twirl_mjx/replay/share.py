@@ -107,10 +107,7 @@ def move(
         The share of the next epoch; and phi of this one with both worths, NaN where phi is a
         number.
     """
-    online = [
-        jnp.where(jnp.isnan(old), new, old + RATE * (new - old))
-        for old, new in ((share.reward, reward), (share.terminated, terminated))
-    ]
+    online = _average(share.reward, reward), _average(share.terminated, terminated)
     source_worth = worth(*_means(source), episode_length)
     online_worth = worth(*online, episode_length)
     goal = jnp.where(source_worth > online_worth, share.high, share.low)
@@ -123,6 +120,11 @@ def move(
     rows = share.rows + RATE * (goal - share.rows)
     share = share.replace(rows=rows, reward=online[0], terminated=online[1])
     return share, {name: jnp.where(moves, value, jnp.nan) for name, value in metrics.items()}
+
+
+def _average(old: jax.Array, new: jax.Array) -> jax.Array:
+    """Return a running mean after an epoch; NaN is none yet."""
+    return jnp.where(jnp.isnan(old), new, old + RATE * (new - old))
 
 
 def _means(ring: RingBuffer) -> tuple[jax.Array, jax.Array]:

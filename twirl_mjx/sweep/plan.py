@@ -254,9 +254,9 @@ def status_of(cell: Cell, runs: Path) -> Status:
 
 
 def arguments(cell: Cell, runs: Path) -> list[str]:
-    """Return the arguments of ``twirl`` that train (or resume) a cell, in a process of its own.
+    """Return the arguments of ``twirl`` that train (or resume) a cell, in another process.
 
-    What came from a user's file is named by it: the other process has not loaded that.
+    What came from a user's file is named by it: that process has not loaded it.
     """
     registries = {"task": TASKS, "learner": LEARNERS, "shift": SHIFTS, "robot": ROBOTS}
     plain = config_json.flatten(make_config(cell.config.task, cell.preset, cell.config.learner)) | {

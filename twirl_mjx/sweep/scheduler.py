@@ -13,7 +13,8 @@ from typing import Any, Literal, Protocol
 
 from twirl_mjx import exits
 from twirl_mjx.sweep.plan import Status
-from twirl_mjx.sweep.worker import Ending, Job, run_job
+from twirl_mjx.sweep.together import Teams, alone
+from twirl_mjx.sweep.worker import Ending, Job, join, run_job
 
 State = Literal["waiting", "running", "busy", "done", "failed", "blocked", "stopped"]
 """``busy``: another process works on the run, which is waited for."""
@@ -43,6 +44,10 @@ class Progress:
     """Machine and core of the last attempt."""
     look_at: float = 0.0
     """Monotonic time of the next look at a busy run, s."""
+    log: str = ""
+    """File with the output of the last attempt."""
+    is_alone: bool = False
+    """Whether it goes on in a process of its own, as that of its team has failed."""
 
 
 class Executor(Protocol):
@@ -183,8 +188,12 @@ def run_all(
     look: Callable[[Job], Status] = lambda job: "missing",
     say: Callable[[str], None] = lambda text: None,
     poll_s: float = 1.0,
+    teams: Teams = alone,
 ) -> dict[str, Progress]:
     """Run every job after those it needs; one that fails takes only its dependants along.
+
+    When the process of a team fails, those of its jobs that are not finished go on each in a
+    process of its own; for them that was no attempt.
 
     Args:
         jobs: What to run; a need that is not among them counts as done.
@@ -195,22 +204,21 @@ def run_all(
         look: Returns how far a job is before it is started, as other processes may work on it.
         say: Prints one line for a person.
         poll_s: Longest time between two looks, s.
+        teams: Puts jobs together that one process runs.
 
     Returns:
         The progress of every job, by name.
     """
-    table = {job.name: Progress(job) for job in jobs}
-    handles: dict[Any, Progress] = {}
+    table = {job.name: Progress(job, log=job.log) for job in jobs}
+    handles: dict[Any, list[Progress]] = {}
     while not stop.is_set():
         _block(table)
         room = executor.capacity()
-        for progress in _ready(table):
+        for candidates in _teams(_ready(table), room - len(handles), teams):
             if len(handles) >= room:
                 break
-            if _is_to_start(progress, look):
-                progress.state, progress.began = "running", time.monotonic()
-                progress.attempts += 1
-                handles[executor.submit(progress.job)] = progress
+            if team := [each for each in candidates if _is_to_start(each, look)]:
+                handles[executor.submit(_begin(team))] = team
         show(table)
         if not handles:
             if all(progress.state not in ("waiting", "busy") for progress in table.values()):
@@ -218,9 +226,9 @@ def run_all(
             stop.wait(poll_s)  # no room at the moment, or others have to finish first
             continue
         for handle in executor.finished(list(handles), poll_s):
-            _settle(handles.pop(handle), handle, executor, retries)
+            _settle(handles.pop(handle), handle, executor, retries, look)
     if handles:
-        _stop_all(handles, executor, show=lambda: show(table), say=say)
+        _stop_all(handles, executor, show=lambda: show(table), look=look, say=say)
     show(table)
     return table
 
@@ -233,6 +241,29 @@ def _ready(table: Mapping[str, Progress]) -> list[Progress]:
         if (p.state == "waiting" or (p.state == "busy" and now >= p.look_at))
         and all(table[n].state == "done" for n in p.job.needs if n in table)
     ]
+
+
+def _teams(ready: Sequence[Progress], room: int, teams: Teams) -> list[list[Progress]]:
+    """Return what may start by the process that is to run it."""
+    if room < 1:
+        return []
+    by_name = {progress.job.name: progress for progress in ready}
+    found = teams([progress.job for progress in ready if not progress.is_alone], room)
+    return [
+        *([by_name[job.name] for job in team] for team in found),
+        *([progress] for progress in ready if progress.is_alone),
+    ]
+
+
+def _begin(team: Sequence[Progress]) -> Job:
+    """Enter the members of a team as running; return their job."""
+    job = join([progress.job for progress in team])
+    for progress in team:
+        progress.state, progress.began, progress.log = "running", time.monotonic(), job.log
+        progress.attempts += 1
+        if len(team) > 1:
+            progress.reason = f"one of {len(team)} in a program"
+    return job
 
 
 def _is_to_start(progress: Progress, look: Callable[[Job], Status]) -> bool:
@@ -268,19 +299,36 @@ def _block(table: Mapping[str, Progress]) -> None:
 _LOST = ("failed", "blocked", "stopped")
 
 
-def _settle(progress: Progress, handle: Any, executor: Executor, retries: int) -> None:
+def _settle(
+    team: Sequence[Progress],
+    handle: Any,
+    executor: Executor,
+    retries: int,
+    look: Callable[[Job], Status],
+) -> None:
     """Enter how an attempt ended: done, to be tried again, stopped or failed.
 
-    An attempt that another process was ahead of does not count.
+    An attempt that another process was ahead of does not count, nor does a failure in a team.
     """
-    progress.seconds = time.monotonic() - progress.began
     try:
         ending = executor.ending(handle)
     except Exception as error:  # the worker was lost: any of Ray's errors
-        code, progress.reason = 1, f"worker lost: {type(error).__name__}"
+        ending, reason = Ending(1, team[0].where), f"worker lost: {type(error).__name__}"
     else:
-        code, progress.where = ending.code, ending.where
-        progress.reason = _reason(code)
+        reason = _reason(ending.code)
+    for progress in team:
+        progress.seconds = time.monotonic() - progress.began
+        progress.where, progress.reason = ending.where, reason
+        failed = ending.code not in (0, exits.BUSY, exits.STOPPED)
+        if len(team) > 1 and failed and _is_to_start(progress, look):
+            progress.state, progress.is_alone = "waiting", True
+            progress.attempts -= 1
+        elif len(team) == 1 or not failed:
+            _settle_one(progress, ending.code, retries)
+
+
+def _settle_one(progress: Progress, code: int, retries: int) -> None:
+    """Enter the exit status of a process whose runs all ended with it."""
     if code == 0:
         progress.state = "done"
     elif code == exits.BUSY:
@@ -301,14 +349,16 @@ def _reason(code: int) -> str:
 
 
 def _stop_all(
-    handles: dict[Any, Progress],
+    handles: dict[Any, list[Progress]],
     executor: Executor,
     show: Callable[[], None],
+    look: Callable[[Job], Status],
     say: Callable[[str], None],
 ) -> None:
     """Ask what runs to stop and wait for it as long as it takes; a second signal kills it."""
     say(
-        f"stopping: {len(handles)} runs end their epoch and save, which may take minutes"
+        f"stopping: {sum(map(len, handles.values()))} runs end their epoch and save, which may"
+        " take minutes"
         " (a second signal kills them: they go on from their last checkpoint)"
     )
     try:
@@ -316,12 +366,14 @@ def _stop_all(
             executor.stop(handle)
         while handles:
             for handle in executor.finished(list(handles), 1.0):
-                progress = handles.pop(handle)
-                _settle(progress, handle, executor, 0)
-                if progress.state == "failed":  # cancelled before or while it stopped
-                    progress.state = "stopped"
+                team = handles.pop(handle)
+                _settle(team, handle, executor, 0, look)
+                for progress in team:
+                    if progress.state in ("failed", "waiting"):  # cancelled before it stopped
+                        progress.state = "stopped"
             show()
     except KeyboardInterrupt:
-        for handle, progress in handles.items():
+        for handle, team in handles.items():
             executor.kill(handle)
-            progress.state, progress.reason = "stopped", "killed at the second signal"
+            for progress in team:
+                progress.state, progress.reason = "stopped", "killed at the second signal"

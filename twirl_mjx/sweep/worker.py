@@ -11,7 +11,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from twirl_mjx.machine import CAN_PIN, runtime_folder, try_lock, usable_cores
@@ -33,6 +33,17 @@ class Job:
     """File that its output is appended to."""
     needs: tuple[str, ...] = ()
     """Names of the jobs that have to be done before."""
+
+
+PROGRAM_WORDS = 3
+"""Arguments of a job before the options of its run: ``-m twirl_mjx train``."""
+
+
+def join(jobs: Sequence[Job]) -> Job:
+    """Return the one job of a team: its runs as one program, with the log of the first."""
+    first, *others = jobs
+    more = [word for job in others for word in ("--and", *job.argv[PROGRAM_WORDS:])]
+    return dataclasses.replace(first, argv=(*first.argv, *more))
 
 
 @dataclasses.dataclass(frozen=True)

@@ -74,8 +74,9 @@ def needs(config: TrainConfig, seeds: int = 1) -> list[Need]:
              _worlds(config, config.eval.final_episodes)),
         Need(f"{name}.hidden_sizes", getattr(droq, "hidden_sizes", ()), _learner(config, droq)),
     ]  # fmt: skip
-    found = [dataclasses.replace(need, size=seeds * need.size) for need in found]
-    return [*found, collecting(config)] if config.uses_source_data else found
+    if config.uses_source_data:
+        found.append(collecting(config))
+    return [dataclasses.replace(need, size=seeds * need.size) for need in found]
 
 
 def collecting(config: TrainConfig) -> Need:

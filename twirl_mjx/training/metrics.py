@@ -38,8 +38,8 @@ METRICS: dict[str, MetricInfo] = {
     "online_rows": MetricInfo("filled rows of the online ring", "1"),
     # Of a run whose phi chooses itself (replay/share.py).
     "phi": MetricInfo("share of source rows in the minibatches of the epoch", "share"),
-    "source_worth": MetricInfo("what an episode of the source data earns, as phi is chosen by", "1"),
-    "online_worth": MetricInfo("the same of the last epochs' transitions", "1"),
+    "source_worth": MetricInfo("mean reward times mean length of an episode of source data", "1"),
+    "online_worth": MetricInfo("the same of the transitions of the last epochs", "1"),
     "compile_s": MetricInfo("time spent compiling (and running once) in the epoch", "s"),
 }
 """What training itself reports; a task adds its measures, a learner its ``metrics``."""

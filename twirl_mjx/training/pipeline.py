@@ -9,36 +9,28 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import hashlib
-import json
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import jax
-import jax.numpy as jnp
 
-from twirl_mjx import exits, files, records
+from twirl_mjx import exits, files
 from twirl_mjx.checks import check_once, choose_one
 from twirl_mjx.policies import recorded, rows
-from twirl_mjx.policies.foreign import MAX_CLIPPED
 from twirl_mjx.policies.resolve import SCRIPTED_SOURCES, Source, check_acts, resolve_policy
-from twirl_mjx.replay import dataset, ring
-from twirl_mjx.training import loop, memory, rundir, source_rules
-from twirl_mjx.training.checkpoint import load_replay
-from twirl_mjx.training.config import TrainConfig
+from twirl_mjx.replay import ring
+from twirl_mjx.training import config_json, loop, memory, rundir, source_rules
+from twirl_mjx.training.collection import Collectors, Say, describe, source_data
+from twirl_mjx.training.config import TrainConfig, of_program
 from twirl_mjx.training.presets import make_config
 from twirl_mjx.training.run import Part
 from twirl_mjx.training.rundir import Busy, Finished, Foreign, RunDir, Status
 from twirl_mjx.training.sinks.base import Sink
 from twirl_mjx.training.sinks.registry import resolve_each
-from twirl_mjx.training.source import collect
 from twirl_mjx.training.weights import check_weights_fit, source_weights
 from twirl_mjx.worlds.make import make_env
-
-Say = Callable[[str], None]
 
 
 class StoppedError(RuntimeError):
@@ -120,10 +112,41 @@ def run_seeds(
         check_seeds(seeds)
         configs = [dataclasses.replace(config, seed=seed) for seed in seeds]
         names = [name and f"{name}-s{seed}" for seed in seeds]
+    return run_together(configs, names, preset, runs_dir, say, source, sinks, deadline)
+
+
+def run_together(
+    configs: Sequence[TrainConfig],
+    names: Sequence[str | None],
+    preset: str,
+    runs_dir: Path,
+    say: Say,
+    source: Source | None = None,
+    sinks: Sequence[str | Sink] = (),
+    deadline: float = math.inf,
+) -> list[RunDir]:
+    """Train runs that differ in seed, phi and source in one program, like :func:`run_seeds`.
+
+    Args:
+        configs: The runs.
+        names: Their names; None: the one a run has alone.
+        preset: As in :func:`run`, like the rest.
+        runs_dir: Folder of all runs.
+        say: Prints one line for a person.
+        source: The source itself, one for all.
+        sinks: Every run has its own.
+        deadline: ``time.monotonic()`` after which a stage saves and stops.
+
+    Raises:
+        ValueError: As :func:`run_seeds`; or runs that differ in more, or that are the same run.
+    """
+    for config in configs[1:]:
+        check_one_program(configs[0], config)
     found = [
         RunDir(runs_dir / rundir.check_name(name or rundir.default_name(config, preset)))
         for config, name in zip(configs, names, strict=True)
     ]
+    check_once("the names of the runs", list(map(str, found)))
     members = [
         Member(*each) for each in zip(configs, found, resolve_each(sinks, len(found)), strict=True)
     ]
@@ -145,6 +168,19 @@ def check_seeds(seeds: Sequence[int]) -> None:
     if not seeds:
         raise ValueError("--seeds names no seed: give at least one, --seeds 0 1 2")
     check_once("--seeds", seeds)
+
+
+def check_one_program(first: TrainConfig, other: TrainConfig) -> None:
+    """Check that two runs can be one program.
+
+    Raises:
+        ValueError: With every setting in which they differ and must not.
+    """
+    if lines := config_json.diff(of_program(first), of_program(other)):
+        raise ValueError(
+            "runs of one program differ in seed, replay.phi and source, and these in"
+            f" {'; '.join(lines)} (nearest: a command for each)"
+        )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -169,11 +205,12 @@ def _run_all(
     source: Source | None,
     deadline: float,
 ) -> None:
-    """Train members whose configs differ in their seeds only."""
+    """Train members whose configs differ in what the runs of one program may."""
     found = [check_early(each.config, preset, each.run_dir, source) for each in members]
     count = sum(not isinstance(status, Finished) for status in found)
     if count and members[0].config.variant != "zero-shot":
-        memory.check_run(members[0].config, count)
+        mixing = [each.config for each in members if each.config.uses_source_data]
+        memory.check_run((mixing or [members[0].config])[0], count)
     if members[0].config.variant != "scratch" and source is None:
         alone = [m for m in members if _outlived_its_source(m.config, preset, runs_dir, m.run_dir)]
         for member in alone:
@@ -260,6 +297,7 @@ def _train(members: list[Member], say: Say, deadline: float) -> None:
         return
     begun = loop.common_step([member.run_dir for member in members])
     rings: dict[str, ring.RingBuffer] = {}
+    collectors: Collectors = {}
     parts = []
     for member in members:
         config, run_dir, source = member.config, member.run_dir, member.source
@@ -272,7 +310,7 @@ def _train(members: list[Member], say: Say, deadline: float) -> None:
                 found = source.data is not None or (config.shift != "none" and source.run_dir)
                 place = source.origin if found else str(run_dir)  # what is found serves all seeds
                 if place not in rings:
-                    rings[place] = source_data(config, run_dir, source, say)
+                    rings[place] = source_data(config, run_dir, source, say, collectors)
                 data = rings[place]
         parts.append(Part(config, run_dir, data, initial, member.sinks))
     outcomes = loop.train(parts, stage=config.task, deadline=deadline)
@@ -305,47 +343,55 @@ def _find_sources(
     members: Sequence[Member], preset: str, runs_dir: Path, say: Say, deadline: float
 ) -> list[Source]:
     """Return the source of every member; those that are missing are trained in one program."""
-    if not members:
-        return []
-    config = members[0].config
-    noise = config.uses_source_data and config.replay.source_noise
-
-    def at(path: Path) -> Source:
-        terms = source_rules.terms_of(config)
-        return resolve_policy(str(path), config.evaluation, noise=noise, terms=terms)
-
     rules = [source_rules.source_of(member.config, preset) for member in members]
-    match rules[0]:
-        case source_rules.NominalRun():
-            return [at(_nominal_run(m.config, preset, runs_dir).path) for m in members]
-        case source_rules.Scripted(name):
-            terms = source_rules.terms_of(config)
-            return [resolve_policy(name, config, terms=terms)] * len(members)
-        case source_rules.InFile(reference):
-            terms = source_rules.terms_of(config)
-            return [resolve_policy(reference, config.evaluation, terms=terms)] * len(members)
-        case source_rules.AtPath(path, is_shipped):
-            if is_shipped:
-                shown = f"assets/policies/{path.name}"
+    first = {
+        rundir.default_name(rule.config, preset): Member(
+            rule.config,
+            RunDir(runs_dir / rundir.default_name(rule.config, preset)),
+            member.sinks,
+        )
+        for rule, member in zip(rules, members, strict=True)
+        if isinstance(rule, source_rules.RunOf)
+    }
+    for each in first.values():
+        say(f"stage 1 of 3: source policy, task {each.config.task}, in {each.run_dir}")
+    if first:
+        _run_all(list(first.values()), preset, runs_dir, say, None, deadline)
+    found: dict[tuple[str, bool], Source] = {}  # equal ones are one object, and compiled once
+    sources = []
+    for rule, member in zip(rules, members, strict=True):
+        config = member.config
+        name = _place_of(rule, config, preset, runs_dir)
+        noise = config.uses_source_data and config.replay.source_noise
+        if (name, noise) not in found:
+            if isinstance(rule, source_rules.AtPath) and rule.is_shipped:
+                shown = f"assets/policies/{rule.path.name}"
                 say(f"source: the shipped policy {shown} (--source train trains your own)")
+            worlds = config if isinstance(rule, source_rules.Scripted) else config.evaluation
+            terms = source_rules.terms_of(config)
+            found[name, noise] = resolve_policy(name, worlds, noise=noise, terms=terms)
+        sources.append(found[name, noise])
+    return sources
+
+
+def _place_of(rule: source_rules.Rule, config: TrainConfig, preset: str, runs_dir: Path) -> str:
+    """Return what ``resolve_policy`` calls the source of a run.
+
+    Raises:
+        FileNotFoundError: A path that does not exist, or no finished nominal run under a shift.
+    """
+    match rule:
+        case source_rules.NominalRun():
+            return str(_nominal_run(config, preset, runs_dir).path)
+        case source_rules.Scripted(name) | source_rules.InFile(name):
+            return name
+        case source_rules.AtPath(path):
             recorded.refuse_format(str(path))
             if not _is_there(path):
                 raise FileNotFoundError(no_such_source(path, runs_dir))
-            return [at(path)] * len(members)
-        case source_rules.RunOf():
-            first = [
-                Member(
-                    rule.config,
-                    RunDir(runs_dir / rundir.default_name(rule.config, preset)),
-                    member.sinks,
-                )
-                for rule, member in zip(rules, members, strict=True)
-                if isinstance(rule, source_rules.RunOf)
-            ]
-            for each in first:
-                say(f"stage 1 of 3: source policy, task {each.config.task}, in {each.run_dir}")
-            _run_all(first, preset, runs_dir, say, None, deadline)
-            return [at(each.run_dir.path) for each in first]
+            return str(path)
+        case source_rules.RunOf(first):
+            return str(runs_dir / rundir.default_name(first, preset))
 
 
 def _is_there(path: Path) -> bool:
@@ -378,103 +424,6 @@ def _nominal_run(config: TrainConfig, preset: str, runs_dir: Path) -> RunDir:
 def _nominal_dir(config: TrainConfig, preset: str, runs_dir: Path) -> RunDir:
     nominal = dataclasses.replace(make_config(config.task, preset), seed=config.seed)
     return RunDir(runs_dir / rundir.default_name(nominal, preset))
-
-
-def source_data(config: TrainConfig, run_dir: RunDir, source: Source, say: Say) -> ring.RingBuffer:
-    """Return the frozen source ring: a nominal run's replay, or freshly collected experience.
-
-    Collected data are kept in ``run_dir/source.npz`` and used again while they fit.
-    """
-    for note in source.notes:
-        say(f"source {source.origin}: {note}")
-    if source.data is not None:
-        say(f"source data: {source.origin}, {len(source.data.reward):,} recorded transitions")
-        return ring.from_transitions(recorded.as_device(source.data))
-    env = make_env(config.evaluation)
-    if config.shift != "none" and source.run_dir is not None:
-        nominal = RunDir(source.run_dir).read_config()
-        source_rules.check_replay_fits(config, nominal, source.run_dir)
-        rows = load_replay(source.run_dir, nominal.replay.capacity)
-        data = ring.from_rows(jnp.asarray(rows), env.observation_size, env.action_size)
-        say(f"source data: the replay of {source.run_dir}, {len(rows):,} transitions")
-        return data
-    path = run_dir.dataset
-    size = config.replay.source_size
-    digest = collection_digest(config, source)
-    if path.exists():
-        header, data = dataset.read(
-            path,
-            task=config.task,
-            observation_size=env.observation_size,
-            action_size=env.action_size,
-        )
-        if header.digest == digest:
-            say(f"source data: {path}, {header.size:,} transitions of {header.source}")
-            return ring.from_transitions(jax.tree.map(jnp.asarray, data))
-        if header.run != run_dir.name:
-            raise rundir.RunMismatchError(
-                f"{path} holds {header.size:,} transitions of {header.source} that this run did not"
-                f" collect{f' (run {header.run} did)' if header.run else ''}; nothing was touched"
-                " (nearest: another --name, or move the file and name it with --source)"
-            )
-        say(f"{path} was collected for other settings: collecting again")
-    say(
-        f"stage 2 of 3: collecting {size:,} transitions of {source.origin} in {config.task}"
-        ", once its worlds are compiled"
-    )
-    data = write_dataset(config, source, path, digest, say)
-    return ring.from_transitions(jax.tree.map(jnp.asarray, data))
-
-
-def collection_digest(config: TrainConfig, source: Source) -> str:
-    """Return a hash of everything that decides a collected dataset."""
-    worlds = config.evaluation
-    decides = {
-        "task": config.task,
-        "shift": [config.shift, config.shift_strength],
-        "options": records.departures(worlds.options),
-        "worlds": [_collecting_worlds(config), worlds.episode_length, worlds.fixed_course],
-        "seed": config.seed,
-        "size": config.replay.source_size,
-        "noise": config.replay.source_noise,
-        "source": source.digest,
-    }
-    return hashlib.sha256(json.dumps(decides, sort_keys=True).encode()).hexdigest()[:12]
-
-
-def _collecting_worlds(config: TrainConfig) -> int:
-    # Whole episodes: with more worlds the data would hold nothing but their beginnings.
-    return min(config.num_envs, max(1, config.replay.source_size // config.eval.episode_length))
-
-
-def write_dataset(config: TrainConfig, source: Source, path: Path, digest: str, say: Say) -> Any:
-    """Collect ``config.replay.source_size`` transitions and write them to ``path``."""
-    size = config.replay.source_size
-    env = make_env(config.evaluation, num_envs=_collecting_worlds(config))
-    key = jax.random.fold_in(jax.random.key(config.seed), 0x50)
-    limit = 1.0 if config.allow_clipping else MAX_CLIPPED
-    data, means = collect(env, source.policy, key, size, max_clipped=limit, say=say)
-    if clipped := means.pop("clipped", 0.0):
-        say(f"{clipped:.1%} of the source's joint targets lay outside the action box: clipped")
-    say("source policy in the target task: " + describe(means))
-    header = dataset.DatasetHeader(
-        task=config.task,
-        shift=config.shift,
-        source=source.origin,
-        size=len(data.reward),
-        observation_size=env.observation_size,
-        action_size=env.action_size,
-        mean_return=means.get("return", float("nan")),
-        digest=digest,
-        run=path.parent.name,
-    )
-    dataset.write(path, header, data)
-    return data
-
-
-def describe(means: dict[str, float]) -> str:
-    """Return measures as one line of text."""
-    return ", ".join(f"{k} {v:.3g}" for k, v in means.items()) or "no episode ended"
 
 
 def zero_shot(config: TrainConfig, run_dir: RunDir, source: Source, say: Say) -> None:

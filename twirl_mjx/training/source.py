@@ -21,66 +21,82 @@ PROGRESS_S = 5.0
 """s between lines of progress."""
 
 
-def collect(
-    env: VectorEnv,
-    policy: SourcePolicy,
-    key: jax.Array,
-    size: int,
-    *,
-    max_clipped: float = 1.0,
-    say: Callable[[str], None] = lambda line: None,
-) -> tuple[Transition, dict[str, float]]:
-    """Return exactly ``size`` transitions of ``policy`` acting in ``env``.
+class Collector:
+    """A policy in the worlds of the target task; what is compiled serves any key."""
 
-    Steps that are not finite are dropped and replaced by further ones.
+    def __init__(self, env: VectorEnv, policy: SourcePolicy) -> None:
+        """Build (not compile) the functions.
 
-    Args:
-        env: Worlds of the target task.
-        policy: The source, a black box.
-        key: Seeds worlds and policy.
-        size: Transitions wanted.
-        max_clipped: Largest share of joint targets outside the action box.
-        say: Gets a line of progress every ``PROGRESS_S``.
+        Args:
+            env: Worlds of the target task.
+            policy: The source, a black box.
+        """
+        self.env = env
+        self._policy = policy
+        self._reset = jax.jit(env.reset)
+        self._run = jax.jit(
+            functools.partial(_collect_chunk, env, policy), static_argnames=("length",)
+        )
 
-    Returns:
-        Transitions [size, ...] (numpy) and the mean measures of the episodes that ended (none
-        when none did); ``clipped`` among them is the share of joint targets that lay outside the
-        action box, if any did.
+    def __call__(
+        self,
+        key: jax.Array,
+        size: int,
+        *,
+        max_clipped: float = 1.0,
+        say: Callable[[str], None] = lambda line: None,
+    ) -> tuple[Transition, dict[str, float]]:
+        """Return exactly ``size`` transitions.
 
-    Raises:
-        DivergedError: More steps than ``MAX_DROPPED`` of ``size`` were dropped.
-        ValueError: A larger share than ``max_clipped`` was clipped.
-    """
-    reset_key, key = jax.random.split(key)
-    state = jax.jit(env.reset)(reset_key)
-    carry = (state, policy.init(state), measures.tracker_init(env.task, env.num_envs))
-    chunk = min(200, -(-size // env.num_envs))
-    run = jax.jit(functools.partial(_collect_chunk, env, policy, chunk))
-    rows: list[Transition] = []
-    kept = dropped = 0
-    cause, outside, tell = "", 0.0, _progress(size, say)
-    sums: dict[str, float] = {}
-    while kept < size:
-        tell(kept)
-        key, chunk_key = jax.random.split(key)
-        carry, (transitions, fault, ended, values, beyond) = run(carry, chunk_key)
-        fault = np.asarray(fault)
-        valid = fault == 0
-        cause = cause or next((FAULTS[i] for i in fault.ravel() if i), "")
-        outside += float(np.asarray(beyond)[valid].sum())
-        ended = np.asarray(ended)
-        rows.append(jax.tree.map(lambda x, keep=valid: np.asarray(x)[keep], transitions))
-        kept, dropped = kept + int(valid.sum()), dropped + int((~valid).sum())
-        for name, value in (values | {"episodes": jnp.ones_like(values["return"])}).items():
-            sums[name] = sums.get(name, 0.0) + float(np.asarray(value)[ended].sum())
-        check_dropped(dropped, kept, size, cause)
-        check_clipped(outside / max(kept, 1), max_clipped)
-    episodes = sums.pop("episodes")
-    means = {name: value / episodes for name, value in sums.items()} if episodes else {}
-    if outside:
-        means["clipped"] = outside / kept
-    data = jax.tree.map(lambda *parts: np.concatenate(parts)[:size], *rows)
-    return data, means
+        Steps that are not finite are dropped and replaced by further ones.
+
+        Args:
+            key: Seeds worlds and policy.
+            size: Transitions wanted.
+            max_clipped: Largest share of joint targets outside the action box.
+            say: Gets a line of progress every ``PROGRESS_S``.
+
+        Returns:
+            Transitions [size, ...] (numpy) and the mean measures of the episodes that ended (none
+            when none did); ``clipped`` among them is the share of joint targets that lay outside
+            the action box, if any did.
+
+        Raises:
+            DivergedError: More steps than ``MAX_DROPPED`` of ``size`` were dropped.
+            ValueError: A larger share than ``max_clipped`` was clipped.
+        """
+        env = self.env
+        reset_key, key = jax.random.split(key)
+        state = self._reset(reset_key)
+        carry = (state, self._policy.init(state), measures.tracker_init(env.task, env.num_envs))
+        chunk = min(200, -(-size // env.num_envs))
+        rows: list[Transition] = []
+        kept = dropped = 0
+        cause, outside, tell = "", 0.0, _progress(size, say)
+        sums: dict[str, float] = {}
+        while kept < size:
+            tell(kept)
+            key, chunk_key = jax.random.split(key)
+            carry, (transitions, fault, ended, values, beyond) = self._run(
+                carry, chunk_key, length=chunk
+            )
+            fault = np.asarray(fault)
+            valid = fault == 0
+            cause = cause or next((FAULTS[i] for i in fault.ravel() if i), "")
+            outside += float(np.asarray(beyond)[valid].sum())
+            ended = np.asarray(ended)
+            rows.append(jax.tree.map(lambda x, keep=valid: np.asarray(x)[keep], transitions))
+            kept, dropped = kept + int(valid.sum()), dropped + int((~valid).sum())
+            for name, value in (values | {"episodes": jnp.ones_like(values["return"])}).items():
+                sums[name] = sums.get(name, 0.0) + float(np.asarray(value)[ended].sum())
+            check_dropped(dropped, kept, size, cause)
+            check_clipped(outside / max(kept, 1), max_clipped)
+        episodes = sums.pop("episodes")
+        means = {name: value / episodes for name, value in sums.items()} if episodes else {}
+        if outside:
+            means["clipped"] = outside / kept
+        data = jax.tree.map(lambda *parts: np.concatenate(parts)[:size], *rows)
+        return data, means
 
 
 def check_dropped(dropped: int, kept: int, size: int, cause: str) -> None:
@@ -124,7 +140,7 @@ def check_clipped(share: float, limit: float) -> None:
 
 
 def _collect_chunk(
-    env: VectorEnv, policy: SourcePolicy, length: int, carry: tuple, key: jax.Array
+    env: VectorEnv, policy: SourcePolicy, carry: tuple, key: jax.Array, *, length: int
 ) -> tuple[tuple, tuple]:
     def step(carry: tuple, step_key: jax.Array) -> tuple[tuple, tuple]:
         state, memory, tracker = carry

@@ -51,6 +51,10 @@ class RunOf:
     config: TrainConfig
 
 
+Rule = NominalRun | Scripted | InFile | AtPath | RunOf
+"""Where the source of a run is found."""
+
+
 def check_replay_fits(config: TrainConfig, nominal: TrainConfig, run_dir: Path) -> None:
     """Check that the replay of a nominal run is experience of the task of ``config``.
 
@@ -107,7 +111,7 @@ def terms_of(config: TrainConfig) -> Terms:
     return Terms(config.source_contract, config.source_command, config.allow_clipping)
 
 
-def source_of(config: TrainConfig, preset: str) -> NominalRun | Scripted | InFile | AtPath | RunOf:
+def source_of(config: TrainConfig, preset: str) -> Rule:
     """Return the source of a run that has one.
 
     ``config.source`` is ``auto`` (the shipped policy, else a run of the source task), ``train``
