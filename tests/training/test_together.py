@@ -63,6 +63,7 @@ def rows_of(path: Path) -> list[dict[str, str]]:
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(1900)
 @pytest.mark.parametrize("index", range(len(RUNS)))
 def test_each_run_is_the_one_that_is_trained_alone(
     index: int, configs: list[TrainConfig], whole: Path, tmp_path: Path
@@ -87,6 +88,7 @@ def test_each_run_is_the_one_that_is_trained_alone(
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(1900)
 def test_they_resume_bit_for_bit(configs: list[TrainConfig], whole: Path, tmp_path: Path) -> None:
     together([dataclasses.replace(config, total_env_steps=64) for config in configs], tmp_path)
     together(configs, tmp_path)
@@ -103,6 +105,7 @@ def test_they_resume_bit_for_bit(configs: list[TrainConfig], whole: Path, tmp_pa
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(1900)
 def test_the_command_line_trains_them_with_one_program_of_collection(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
