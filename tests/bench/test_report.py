@@ -237,6 +237,17 @@ def assert_ended(note: Path) -> None:
     assert not is_running(child)
 
 
+def test_rows_of_worlds_that_ran_out_of_time_are_the_record(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def command(name: str, words: list[str]) -> list[str]:
+        assert words[-2] == "--keep"
+        return ["sh", "-c", f'echo \'{{"part": "worlds"}}\' > {words[-1]}; sleep 60']
+
+    monkeypatch.setattr(bench, "part_command", command)
+    assert bench.run_part("worlds", [], 1.0) == {"part": "worlds"}
+
+
 def test_part_out_of_time_ends_with_its_children(child_of_part: Path) -> None:
     assert "stopped after" in bench.run_part("startup", [], 0.5)["error"]
     assert_ended(child_of_part)

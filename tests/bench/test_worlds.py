@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -84,6 +85,28 @@ def test_rows_after_the_limit_are_left_out_with_a_reason(monkeypatch: pytest.Mon
     assert found["rows"] == []
     assert [s["num_envs"] for s in found["skipped"]] == [1, 16]
     assert "--limit" in found["skipped"][0]["reason"]
+
+
+def test_rows_are_kept_for_a_caller_that_ends_the_measurement(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    def measured(task: str, engine: str, num_envs: int, seconds: float) -> dict[str, Any]:
+        if num_envs == 16:
+            raise KeyboardInterrupt
+        return row(engine, num_envs, 512.0)
+
+    monkeypatch.setattr(worlds, "measure_row", measured)
+    kept = tmp_path / "kept.json"
+    with pytest.raises(KeyboardInterrupt):
+        worlds.measure(WorldsBench(engine="native", num_envs=(1, 16, 128), keep=kept))
+    record = json.loads(kept.read_text())
+    assert [(r["engine"], r["num_envs"]) for r in record["rows"]] == [
+        ("native", 1), ("native", 128),
+    ]  # fmt: skip
+    assert [(r["num_envs"], r["reason"]) for r in record["skipped"]] == [
+        (16, "not done when the part was stopped")
+    ]
+    assert record["control_steps_per_s"] == 512.0
 
 
 def test_missing_envpool_is_named(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -12,7 +12,8 @@ import functools
 import importlib.util
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any, Literal
 
 import jax
@@ -20,6 +21,7 @@ import jax.numpy as jnp
 import mujoco.rollout
 import numpy as np
 
+from twirl_mjx import files
 from twirl_mjx.bench.measure import (
     DEFAULT_TASK,
     Chain,
@@ -58,6 +60,8 @@ class WorldsBench:
     """s, no further row is started after this time; rows that are left out say so."""
     engine: Literal["both", "mjx", "native"] = "both"
     """Physics engine."""
+    keep: Path | None = None
+    """Write the JSON document here after every row, for a caller that may end this."""
     num_envs: tuple[int, ...] = (1, 16, 128, 1024)
     """Numbers of worlds stepped together."""
     task: str = DEFAULT_TASK
@@ -228,16 +232,46 @@ def measure(options: WorldsBench) -> Record:
     record_machine = machine()
     each = options.seconds / (len(options.num_envs) * len(options.engines))
     order = sorted(set(options.num_envs), key=lambda n: (n != HEADLINE_WORLDS, n))
-    rows, skipped = [], []
-    for engine in options.engines:
-        for num_envs in order:
-            if time.perf_counter() - began > options.limit:
-                reason = f"not started after {options.limit:g} s (--limit)"
-                skipped.append({"engine": engine, "num_envs": num_envs, "reason": reason})
-                continue
-            rows.append(measure_row(options.task, engine, num_envs, each))
-    rate, reason = envpool_rate(HEADLINE_WORLDS, each)
-    rows.sort(key=lambda row: (row["engine"], row["num_envs"]))
+    todo = [(engine, num_envs) for engine in options.engines for num_envs in order]
+    rows: list[Record] = []
+    for index, (engine, num_envs) in enumerate(todo):
+        if time.perf_counter() - began > options.limit:
+            reason = f"not started after {options.limit:g} s (--limit)"
+            skipped = left_out(todo[index:], reason)
+            break
+        rows.append(measure_row(options.task, engine, num_envs, each))
+        if options.keep is not None:
+            rest = left_out(todo[index + 1 :], "not done when the part was stopped")
+            given = rows, rest, (None, "not reached"), record_machine
+            files.write_json(options.keep, record_of(options, *given))
+    else:
+        skipped = []
+    pool = envpool_rate(HEADLINE_WORLDS, each)
+    return record_of(options, rows, skipped, pool, record_machine)
+
+
+def left_out(todo: Sequence[tuple[str, int]], reason: str) -> list[Record]:
+    """Return why rows (engine, worlds) are not there."""
+    return [{"engine": engine, "num_envs": n, "reason": reason} for engine, n in todo]
+
+
+def record_of(
+    options: WorldsBench,
+    measured: Sequence[Record],
+    skipped: list[Record],
+    pool: tuple[float | None, str | None],
+    record_machine: Record,
+) -> Record:
+    """Return the record of the rows that are measured, see ``measure``.
+
+    Args:
+        options: What was asked for.
+        measured: The rows.
+        skipped: The rows that are not there.
+        pool: Rate of EnvPool's quadruped, or why there is none.
+        record_machine: The machine before the start.
+    """
+    rows = sorted(measured, key=lambda row: (row["engine"], row["num_envs"]))
     head = headline(rows, options)
     speedups = {
         str(row["num_envs"]): row["control_steps_per_s"] / other["control_steps_per_s"]
@@ -252,8 +286,8 @@ def measure(options: WorldsBench) -> Record:
         "rows": rows,
         "skipped": skipped,
         "native_over_mjx": speedups,
-        "envpool_quadruped_steps_per_s": rate,
-        "envpool_reason": reason,
+        "envpool_quadruped_steps_per_s": pool[0],
+        "envpool_reason": pool[1],
         "machine": record_machine,
     }
 

@@ -10,6 +10,7 @@ import os
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -169,6 +170,8 @@ def part_arguments(name: str, options: AllBench) -> list[str]:
 def run_part(name: str, arguments: list[str], left: float) -> dict[str, Any]:
     """Run one part; its record, or ``{"part": ..., "error": ...}``.
 
+    Of worlds that ran out of time the rows that were measured are the record.
+
     However it ends, no process that it started goes on beside the next measurement.
 
     Args:
@@ -181,9 +184,11 @@ def run_part(name: str, arguments: list[str], left: float) -> dict[str, Any]:
     """
     if left <= 0:
         return {"part": name, "error": "no time left (--minutes)"}
-    with _signals_interrupt():
+    with _signals_interrupt(), tempfile.TemporaryDirectory() as folder:
+        kept = Path(folder) / "kept.json"
+        words = ["--keep", str(kept)] if name == "worlds" else []
         process = subprocess.Popen(
-            part_command(name, arguments),
+            part_command(name, [*arguments, *words]),
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             start_new_session=True,
@@ -191,6 +196,8 @@ def run_part(name: str, arguments: list[str], left: float) -> dict[str, Any]:
         try:
             output, _ = process.communicate(timeout=left)
         except subprocess.TimeoutExpired:
+            if kept.is_file():
+                return files.read_json(kept, "the rows of a measurement")
             return {"part": name, "error": f"stopped after {left:.0f} s (--minutes)"}
         finally:
             _end_group(process)
