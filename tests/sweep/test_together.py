@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import csv
+import shutil
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -10,6 +12,7 @@ from typing import Any
 import pytest
 
 from twirl_mjx import exits
+from twirl_mjx.commands import sweep as sweep_command
 from twirl_mjx.commands import sweep_run
 from twirl_mjx.commands.train import split
 from twirl_mjx.sweep import scheduler, together
@@ -136,3 +139,69 @@ def test_a_team_that_was_stopped_is_no_failure(tmp_path: Path, here_executor: An
     words = f"import sys; sys.exit({exits.STOPPED})"
     table = run(jobs_of("ab", tmp_path, words), here_executor(), lambda job: "missing")
     assert {(p.state, p.attempts) for p in table.values()} == {("stopped", 1)}
+
+
+TWO_BY_TWO = """
+GRID = (
+    {"preset": "debug", "seeds": (0, 1), "base": {"task": "biped", "source": "trot"},
+     "axes": {"phi": {f"phi{p}": {"replay.phi": p} for p in (0.25, "auto")}}},
+)
+"""
+
+
+def values_of(run_dir: Path, name: str) -> dict[tuple[str, ...], float]:
+    """Rows of a table of a run by what they are of, without what depends on the time."""
+    with (run_dir / name).open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    timed = ("env_steps_per_s", "updates_per_s", "compile_s")
+    return {
+        tuple(row[k] for k in row if k not in ("value", "wall_s")): float(row["value"])
+        for row in rows
+        if row["metric"] not in timed
+    }
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1900)
+def test_a_grid_as_one_program_against_single_runs(
+    tmp_path: Path, here_executor: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    grid = tmp_path / "mine.py"
+    grid.write_text(TWO_BY_TWO)
+    submitted: list[list[str]] = []
+
+    class Executor(here_executor):
+        def __init__(self, **_: object) -> None:
+            super().__init__(room=1)
+            submitted.append(self.submitted)
+
+        def __enter__(self) -> Executor:
+            return self
+
+        def __exit__(self, *_: object) -> None:
+            pass
+
+    monkeypatch.setattr(sweep_run, "RayExecutor", Executor)
+
+    def sweep(folder: str, *more: str) -> list[Path]:
+        runs, results = str(tmp_path / folder), str(tmp_path / "results" / folder)
+        argv = [str(grid), "--runs", runs, "--results", results, *more]
+        assert sweep_command.main(argv) == 0
+        return sorted((tmp_path / folder).glob("biped-*"))
+
+    whole, single = sweep("together"), sweep("single", "--together", "1")
+    assert [len(each) for each in submitted] == [1, 4]
+    assert [path.name for path in whole] == [path.name for path in single]
+    assert len(whole) == 4
+    tables = [(path, name) for path in whole for name in ("metrics.csv", "eval.csv")]
+    before = {table: values_of(*table) for table in tables}
+    for (path, name), found in before.items():
+        assert found == pytest.approx(
+            values_of(tmp_path / "single" / path.name, name), rel=1e-3, abs=1e-3
+        )
+    for path in whole:  # as after a kill while the second cell was saved
+        (path / "eval.csv").unlink()
+    shutil.rmtree(whole[1] / "checkpoints" / "orbax" / "96")
+    assert sweep("together") == whole
+    assert len(submitted[-1]) == 1
+    assert {table: values_of(*table) for table in tables} == before

@@ -123,8 +123,8 @@ def test_the_command_line_trains_them_with_one_program_of_collection(
     assert cli.main(words) == 0
     first, second = sorted(path.name for path in tmp_path.iterdir())
     assert f"done: {tmp_path / first} {tmp_path / second}" in capsys.readouterr().out
-    assert "replay.phi" in first
-    assert "auto" in second
+    assert first.endswith("phi_0.25")
+    assert second.endswith("phi_auto")
     assert [collector._run._cache_size() for collector in made] == [1]
 
 
