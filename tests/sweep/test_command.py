@@ -170,7 +170,7 @@ def test_a_cell_of_another_sweep_is_left_to_it(
     monkeypatch.setattr(sweep_run, "RayExecutor", Executor)
     monkeypatch.setattr(scheduler, "BUSY_LOOK_S", 0.0)
     argv = [str(grid_file), "--runs", str(runs), "--results", str(tmp_path / "results")]
-    assert sweep.main(argv) == 0
+    assert sweep.main([*argv, "--together", "1"]) == 0
     assert sorted(started) == sorted(cell.name for cell in others)
     said = capsys.readouterr().out
     assert "busy     first: stand s0 | in use by another process" in said

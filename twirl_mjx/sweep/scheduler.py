@@ -49,6 +49,10 @@ class Progress:
     is_alone: bool = False
     """Whether it goes on in a process of its own, as that of its team has failed."""
 
+    def __post_init__(self) -> None:
+        """Begin with the log of the job."""
+        self.log = self.log or self.job.log
+
 
 class Executor(Protocol):
     """Something that runs jobs elsewhere."""
@@ -209,7 +213,7 @@ def run_all(
     Returns:
         The progress of every job, by name.
     """
-    table = {job.name: Progress(job, log=job.log) for job in jobs}
+    table = {job.name: Progress(job) for job in jobs}
     handles: dict[Any, list[Progress]] = {}
     while not stop.is_set():
         _block(table)
