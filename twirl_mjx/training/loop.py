@@ -121,6 +121,9 @@ class Batch:
         if len(self.runs) == 1:
             return self.runs[0].run_dir.name
         first = self.runs[0]
+        seed = first.config.seed
+        if any(dataclasses.replace(r.config, seed=seed) != first.config for r in self.runs):
+            return f"{first.run_dir.name} and {len(self.runs) - 1} more"
         stem = "".join(first.run_dir.name.rsplit(f"-s{first.config.seed}", 1))
         return f"{stem}, seeds {' '.join(str(run.config.seed) for run in self.runs)}"
 
