@@ -103,23 +103,6 @@ def test_update_is_u_critic_steps_then_one_actor_and_temperature_step(
     np.testing.assert_allclose(metrics["temperature_loss"], surplus, rtol=1e-4)
 
 
-def test_actor_and_temperature_wait_for_the_critics(state, small_config, transitions):
-    """With a delay of 2 U updates the third block is the first to move them, as if it began."""
-    config = dataclasses.replace(small_config, actor_delay=2 * U)
-    batch = transitions(jax.random.key(1), U, config.batch_size)
-    current = state
-    for i in range(3):
-        new, metrics = update(current, config, batch, jax.random.key(i))
-        moves = i == 2
-        for part in ("actor", "actor_opt", "log_temperature", "temperature_opt"):
-            change = jax.tree.leaves(largest_change(getattr(new, part), getattr(current, part)))
-            assert (min(change) > 0) if moves else (max(change) == 0), (i, part)
-        assert min(jax.tree.leaves(largest_change(new.critic, current.critic))) > 0
-        assert int(new.actor_opt.count) == moves
-        assert np.isfinite(metrics["actor_loss"])
-        current = new
-
-
 @EVERY_FORM
 def test_counters_types_and_metrics(state, small_config, transitions, count_traces, form):
     config = in_form(small_config, form)

@@ -31,9 +31,6 @@ class DroqConfig:
     """Critic updates per environment transition; may be below 1."""
     updates_per_block: int = 20
     """Critic updates between two updates of actor and temperature (20 = the paper's at UTD 20)."""
-    actor_delay: int = 0
-    """Critic updates before the first one of actor and temperature: critics that begin anew learn
-    what an actor that was taken over from a policy file is worth, before they change it."""
     target_entropy: float | None = None
     """nats; -A/2 when not given."""
     initial_temperature: float = 1.0
@@ -60,7 +57,6 @@ class DroqConfig:
         check_range("droq.tau", self.tau, 0.0, 1.0)
         check_range("droq.utd", self.utd, 1e-6, 1000.0)
         check_range("droq.updates_per_block", self.updates_per_block, 1, 100_000)
-        check_range("droq.actor_delay", self.actor_delay, 0, 1_000_000_000)
         check_range("droq.initial_temperature", self.initial_temperature, 1e-6, 100.0)
         if self.target_entropy is not None:
             check_range("droq.target_entropy", self.target_entropy, -1e4, 1e4)

@@ -66,8 +66,6 @@ def update(
 ) -> tuple[DroqState, Metrics]:
     """Take U critic steps, then one actor and one temperature step on the last minibatch.
 
-    Up to ``config.actor_delay`` critic steps in all, actor and temperature stay as they are.
-
     Args:
         state: Learner state.
         config: Learner settings; static under jit.
@@ -97,11 +95,8 @@ def update(
         grad_steps=state.grad_steps + minibatches.reward.shape[0],
     )
     noise = jax.random.normal(noise_key, minibatches.action.shape[1:])
-    after, actor_metrics = actor_step(state, config, minibatches.obs[-1], noise, actor_key)
-    if config.actor_delay:
-        early = state.grad_steps <= config.actor_delay
-        after = jax.tree.map(lambda old, new: jnp.where(early, old, new), state, after)
-    return after, critic_metrics | actor_metrics
+    state, actor_metrics = actor_step(state, config, minibatches.obs[-1], noise, actor_key)
+    return state, critic_metrics | actor_metrics
 
 
 def actor_step(
