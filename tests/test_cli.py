@@ -15,7 +15,7 @@ from twirl_mjx import cli, files
 from twirl_mjx.commands import collect, demo, options, render
 from twirl_mjx.replay import dataset
 from twirl_mjx.sim.gl import RenderError
-from twirl_mjx.training import pipeline
+from twirl_mjx.training import collection, pipeline
 from twirl_mjx.training.rundir import RunDir
 
 
@@ -167,7 +167,7 @@ def test_collect_says_what_happened(
 
     source = SimpleNamespace(identity={"origin": "x", "digest": "y"}, run_dir=run_dir, data=None)
     monkeypatch.setattr(pipeline, "find_source", lambda *_: source)
-    monkeypatch.setattr(pipeline, "source_data", source_data)
+    monkeypatch.setattr(collection, "source_data", source_data)
     words = ["--task", "biped", "--preset", "debug", "--shift", "icy", "--runs", str(tmp_path)]
     path = tmp_path / "mine" / "source.npz"
     if existing:
