@@ -120,7 +120,7 @@ def test_rows_carry_their_commands_and_numbers(html, elements):
     text = "".join(elements.text)
     assert "Reduced: 100k of 1M transitions, 2 seeds" in text
     assert "biped: highest return " in text
-    assert "(2 runs (few)): twirl, 2." in text
+    assert "(only 2 runs): twirl, 2." in text
     assert " times that of scratch" in text
     assert "source (learns nothing)" in text
     assert "episodes (1 run)" in text  # what the interval of a single policy is over

@@ -40,3 +40,38 @@ def test_the_report_opens_offline_in_both_colour_schemes(browser, report_file):
     urls = [e["request"]["url"] for e in browser.of("Network.requestWillBeSent")]
     assert {url.split(":")[0] for url in urls} <= {"file", "data"}
     assert [url for url in urls if url.startswith("file")] == [report_file.as_uri()] * 2
+
+
+BOX = "(e => { const b = e.getBoundingClientRect(); return [b.x, b.y, b.width, b.height]; })"
+
+
+@pytest.mark.timeout(180)
+def test_a_figure_is_small_until_it_is_clicked_and_again_after(browser, report_file):
+    browser.send(
+        "Emulation.setDeviceMetricsOverride", width=1100, height=700, deviceScaleFactor=1,
+        mobile=False,
+    )  # fmt: skip
+    browser.open(report_file.as_uri())
+    browser.run(MEDIA)
+    script = "[...document.querySelectorAll('.plot')].filter(f => f.checkVisibility()).map(%s)"
+    boxes = browser.run(script % BOX)
+    assert len(boxes) == 2  # the paper's style is folded
+    assert all(200 < width < 400 and height < 260 for _, _, width, height in boxes)
+    image = "document.querySelector('.plot img')"
+    browser.run(f"{image}.scrollIntoView()")
+    place = browser.run("window.scrollY")
+    before = browser.run(BOX + f"({image})")
+    click(browser, before)
+    _, _, width, height = browser.run(BOX + f"({image})")
+    natural = browser.run(f"[{image}.naturalWidth, {image}.naturalHeight]")
+    assert [width, height] == pytest.approx(natural, abs=1)
+    assert browser.run(BOX + "(document.querySelector('.plot summary'))")[3] == 700
+    click(browser, (20, 20, 100, 100))  # anywhere
+    assert browser.run(BOX + f"({image})") == before
+    assert browser.run("window.scrollY") == place
+
+
+def click(browser, box):
+    at = {"x": box[0] + box[2] / 2, "y": box[1] + box[3] / 2, "button": "left", "clickCount": 1}
+    for kind in ("mousePressed", "mouseReleased"):
+        browser.send("Input.dispatchMouseEvent", type=kind, **at)

@@ -108,8 +108,8 @@ def table(
     )
 
 
-def picture(light: bytes, dark: bytes, alt: str, caption: str = "") -> str:
-    """Return a figure that follows the light or dark setting.
+def thumbnail(light: bytes, dark: bytes, alt: str, caption: str) -> str:
+    """Return a figure shown small, which fills the window while it is open; needs no script.
 
     Args:
         light: PNG for a light page.
@@ -118,11 +118,18 @@ def picture(light: bytes, dark: bytes, alt: str, caption: str = "") -> str:
         caption: Visible caption.
     """
     night, day = data_uri(dark, "image/png"), data_uri(light, "image/png")
-    below = f"<figcaption>{escape(caption)}</figcaption>" if caption else ""
     return (
-        f'<figure class="plot"><picture><source media="(prefers-color-scheme: dark)" '
-        f'srcset="{night}"><img src="{day}" alt="{escape(alt)}"></picture>{below}</figure>'
+        '<figure class="plot"><details name="plot"><summary><picture>'
+        f'<source media="(prefers-color-scheme: dark)" srcset="{night}">'
+        f'<img src="{day}" alt="{escape(alt)}"></picture></summary></details>'
+        f"<figcaption>{escape(caption)}</figcaption></figure>"
     )
+
+
+def fold(name: str, body: str, *, opened: bool) -> str:
+    """Return a part of the page under a line that opens and closes it."""
+    state = " open" if opened else ""
+    return f"<details{state}><summary>{escape(name)}</summary>{body}</details>"
 
 
 def clip(media: Media) -> str:
@@ -193,18 +200,27 @@ section { background: var(--card); border: 1px solid var(--line); border-radius:
 .findings { padding-left: 20px; margin: 8px 0 14px; }
 figure { margin: 14px 0; }
 figure img, figure video { display: block; max-width: 100%; height: auto; border-radius: 6px; }
-.plot img { width: auto; max-height: 720px; }
-.clips { display: grid; grid-template-columns: repeat(auto-fit, minmax(300px, 1fr)); gap: 18px; }
+.plots { display: grid; grid-template-columns: repeat(auto-fill, minmax(250px, 1fr)); gap: 16px; }
+.plot { margin: 0; }
+.plot details { height: 200px; margin: 0; }
+.plot summary { display: block; height: 100%; cursor: zoom-in; }
+.plot summary::-webkit-details-marker { display: none; }
+.plot img { width: 100%; height: 200px; object-fit: contain; object-position: left top; }
+.plot [open] summary { position: fixed; inset: 0; z-index: 2; height: auto; overflow: auto;
+  padding: 20px; background: var(--page); cursor: zoom-out; }
+.plot [open] img { width: auto; height: auto; margin: 0 auto; }
+.clips { display: grid; grid-template-columns: repeat(auto-fill, minmax(320px, 1fr)); gap: 18px; }
 .clips figure { margin: 0; }
 .clips img, .clips video { width: 100%; background: #000; }
 figcaption { font-size: 0.88rem; margin-top: 6px; }
-.scroll { overflow-x: auto; margin: 12px 0; }
+.scroll { overflow: auto; max-height: 440px; margin: 12px 0; }
 table { border-collapse: collapse; font-size: 0.86rem; min-width: 60%;
   font-variant-numeric: tabular-nums; }
 caption { text-align: left; padding: 4px 0 8px; }
 th, td { padding: 5px 9px; border-bottom: 1px solid var(--line); text-align: left;
   white-space: nowrap; vertical-align: baseline; }
-thead th { border-bottom: 2px solid var(--line); font-weight: 600; }
+thead th { position: sticky; top: 0; background: var(--card); font-weight: 600;
+  box-shadow: inset 0 -2px var(--line); }
 tbody th { font-weight: 600; }
 tbody tr:hover { background: var(--code); }
 th:first-child, td:first-child { padding-left: 0; }
@@ -212,7 +228,7 @@ th:first-child, td:first-child { padding-left: 0; }
 .best { font-weight: 700; }
 .bounds { display: block; color: var(--quiet); font-size: 0.92em; font-weight: 400; }
 .idle { color: var(--quiet); font-weight: 400; }
-.commands { white-space: normal; min-width: 170px; }
+.commands { white-space: normal; min-width: 340px; }
 code { font: 0.92em ui-monospace, "DejaVu Sans Mono", Menlo, Consolas, monospace;
   background: var(--code); padding: 1px 5px; border-radius: 4px; }
 .command { user-select: all; overflow-wrap: anywhere; }
@@ -220,6 +236,8 @@ details { margin: 10px 0; }
 summary { cursor: pointer; color: var(--accent); font-weight: 600; }
 dt { font-weight: 600; } dd { margin: 0 0 8px; max-width: 80ch; }
 footer { padding-bottom: 40px; font-size: 0.9rem; }
-@media print { section { break-inside: avoid; border: none; padding: 0; } nav { display: none; } }
+@media print { section { border: none; padding: 0; } nav { display: none; }
+  .scroll { max-height: none; } .plots { grid-template-columns: 1fr 1fr; }
+  .plot details, .plot img { height: auto; } }
 """
 """Style sheet: two palettes, no fonts or pictures from elsewhere."""

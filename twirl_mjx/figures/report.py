@@ -87,7 +87,8 @@ def write_report(
     sections = []
     for i, (grid, tables) in enumerate(grids.items()):
         say(f"drawing grid '{grid}', {i + 1} of {len(grids)}")
-        sections.append((grid, _facts(tables).title or f"Grid: {grid}", _grid_html(grid, *tables)))
+        html = _grid_html(grid, *tables, opened=not sections)
+        sections.append((grid, _facts(tables).title or f"Grid: {grid}", html))
     if clips:
         sections.insert(1, ("clips", "Clips", f'<div class="clips">{shown}</div>'))
     sections.append(("terms", "How to read the numbers", TERMS))
@@ -125,10 +126,10 @@ def _lead(grids: dict[str, tuple[Table | None, Table | None]]) -> str:
     text = f"{len(grids)} grid{'s' * (len(grids) != 1)}, {len(names)} run{'s' * (len(names) != 1)}."
     if any(reduced_caption(table) for table in tables):
         text += " Some results come from reduced budgets; each says so where it is shown."
-    return escape(text)
+    return escape(f"{text} Click a figure to see it whole, and once more to go back.")
 
 
-def _grid_html(grid: str, curves: Table | None, episodes: Table | None) -> str:
+def _grid_html(grid: str, curves: Table | None, episodes: Table | None, *, opened: bool) -> str:
     pieces = []
     if about := _facts((curves, episodes)).about:
         pieces.append(f"<p>{escape(about)}</p>")
@@ -141,10 +142,9 @@ def _grid_html(grid: str, curves: Table | None, episodes: Table | None) -> str:
         if reduced := reduced_caption(table):
             pieces.append(f'<p class="reduced">{escape(reduced)}</p>')
         pieces += [_findings(parts), _figures(grid, table, parts)]
-        for part in parts:
-            pieces += [_main_table(part), _more_table(part)]
-        if not table.is_episodes:
-            pieces.append(_runs_table(parts))
+        shown = [text for part in parts for text in (_main_table(part), _more_table(part))]
+        shown += [] if table.is_episodes else [_runs_table(parts)]
+        pieces.append(page.fold("Tables", "".join(shown), opened=opened))
     return "".join(pieces)
 
 
@@ -161,10 +161,10 @@ def _figures(grid: str, table: Table, parts: Sequence[Part]) -> str:
     for drawing in drawings(grid, *tables):
         if drawing.metric in leads:
             (more if drawing.statistic == "mean" else first).append(_figure(drawing, parts))
-    html = "".join(first)
+    html = f'<div class="plots">{"".join(first)}</div>'
     if more:
-        html += "<details><summary>The same as mean ± standard deviation (paper style)</summary>"
-        html += "".join(more) + "</details>"
+        name = "The same as mean ± standard deviation (paper style)"
+        html += page.fold(name, f'<div class="plots">{"".join(more)}</div>', opened=False)
     return html
 
 
@@ -178,7 +178,8 @@ def _figure(drawing: Drawing, parts: Sequence[Part]) -> str:
     ]
     kind = {"curves": "Learning curves", "bars": "Bars", "ablation": "Ablation"}[drawing.kind]
     unit = f" in {measure.unit}" if measure.unit else ""
-    return page.picture(light, dark, f"{kind} of {measure.label}{unit}. {'; '.join(shown)}.")
+    about = f"{kind} of {measure.label}"
+    return page.thumbnail(light, dark, f"{about}{unit}. {'; '.join(shown)}.", about)
 
 
 _FEW_PLACES = 3
@@ -248,7 +249,7 @@ def _over(interval: Interval, summary: Summary) -> str:
         return "1 run, no interval" if runs == 1 else f"{runs} runs"
     if interval.over == "episodes":
         return "episodes (1 run)"
-    return interval.over.replace("runs", f"{runs} runs" + " (few)" * (runs < FEW_RUNS), 1)
+    return interval.over.replace("runs", "only " * (runs < FEW_RUNS) + f"{runs} runs", 1)
 
 
 def _more_table(part: Part) -> str:
@@ -267,8 +268,7 @@ def _more_table(part: Part) -> str:
     header = ["task, shift", "arm", *(part.table.facts.label(m) for m in others)]
     caption = "IQM (mean for shares) with 95 % interval"
     body = page.table(caption, header, lines, numeric=range(2, len(header)))
-    opened = " open" if len(lines) <= _SHORT_TABLE else ""
-    return f"<details{opened}><summary>Other measures</summary>{body}</details>"
+    return page.fold("Other measures", body, opened=len(lines) <= _SHORT_TABLE)
 
 
 def _runs_table(parts: Sequence[Part]) -> str:
@@ -291,7 +291,7 @@ def _runs_table(parts: Sequence[Part]) -> str:
             )
     header = ["run", "seed", "transitions", "updates", "wall time", "last value", "file"]
     body = page.table("Every run with its last main value", header, lines, numeric=range(1, 6))
-    return f"<details><summary>Single runs ({len(lines)})</summary>{body}</details>"
+    return page.fold(f"Single runs ({len(lines)})", body, opened=False)
 
 
 def _commands(grid: str, summary: Summary) -> tuple[str, ...]:
