@@ -119,6 +119,42 @@ def transition_code() -> tuple[Callable[..., Transition], Callable[[Transition],
     return coded_transitions, decoded_ids
 
 
+def clipped_texts(figure: Any) -> list[str]:
+    """Return the texts of a matplotlib figure that reach over the edge of its canvas."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.text import Text
+
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    ticks = {axis: axis.get_ticklabels(which="both") for a in figure.axes for axis in axes_of(a)}
+    unseen = [
+        label
+        for axis, labels in ticks.items()
+        for label in labels
+        if label not in [tick.label1 for tick in axis._update_ticks()]
+    ]
+    edge = figure.bbox.padded(1)
+    shown = [t for t in figure.findobj(Text) if t.get_visible() and t not in unseen]
+    boxes = {t: t.get_window_extent(canvas.get_renderer()) for t in shown if t.get_text().strip()}
+    assert boxes
+    return [
+        text.get_text()
+        for text, box in boxes.items()
+        if not (edge.contains(box.x0, box.y0) and edge.contains(box.x1, box.y1))
+    ]
+
+
+def axes_of(axes: Any) -> tuple[Any, Any]:
+    """Return the two axes of a panel."""
+    return axes.xaxis, axes.yaxis
+
+
+@pytest.fixture
+def clipped() -> Callable[[Any], list[str]]:
+    """The function above."""
+    return clipped_texts
+
+
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
 BROWSER_FLAGS = (
     "--headless",

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Callable
 from pathlib import Path
 
 import imageio.v3 as iio
@@ -26,6 +28,17 @@ def test_figures_are_written(leap: Clip, tmp_path: Path) -> None:
         image = iio.imread(tmp_path / name)
         assert image.shape[0] > 600
         assert image[..., :3].std() > 10
+
+
+def test_nothing_is_clipped_however_long_the_names_are(
+    leap: Clip, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, clipped: Callable
+) -> None:
+    drawn = []
+    monkeypatch.setattr("twirl_mjx.motion.show._save", lambda figure, path: drawn.append(figure))
+    named = dataclasses.replace(leap, name="my_leap_over_the_brook_" * 8)
+    show(named, tmp_path / "a.png")
+    compare([named, leap], tmp_path / "b.png", source="a motion library, " * 9)
+    assert [clipped(figure) for figure in drawn] == [[], []]
 
 
 def test_pitch_is_positive_nose_up() -> None:

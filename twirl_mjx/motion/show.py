@@ -5,6 +5,7 @@ Pictures of the robot in the poses of a clip: ``deploy.render`` with ``clip.conf
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -20,6 +21,8 @@ FOOT_COLORS = ("#D55E00", "#E69F00", "#0072B2", "#56B4E9")
 """FR FL RR RL: warm colours in front, cold ones behind (Okabe and Ito's palette)."""
 NEAR_GROUND = 0.005
 """m, a foot lower than this counts as standing in the figures."""
+_LINE = 66
+"""Letters that a line of the figures has room for."""
 
 
 def pitch_angles(clip: Clip) -> np.ndarray:
@@ -84,11 +87,9 @@ def show(clip: Clip, path: str | Path) -> None:
     phases.set_ylabel("contact")
     phases.set_xlabel("time (s), all feet airborne where shaded")
     distance = float(np.linalg.norm(clip.cycle_displacement[:2]))
-    height.set_title(
-        f"{clip.name}: {distance:.2f} m in {clip.cycle_duration:.2f} s, "
-        f"{flight[:-1].sum() * clip.frame_duration:.2f} s of it airborne",
-        loc="left",
-    )
+    title = f"{clip.name}: {distance:.2f} m in {clip.cycle_duration:.2f} s, "
+    title += f"{flight[:-1].sum() * clip.frame_duration:.2f} s of it airborne"
+    height.set_title(textwrap.fill(title, _LINE), loc="left")
     _save(figure, Path(path))
 
 
@@ -109,7 +110,8 @@ def compare(clips: Sequence[Clip], path: str | Path, source: str = "") -> None:
         lowest = feet[..., 2] - clip.robot.foot_radius
         apex = np.argmax(lowest.min(axis=1))  # line the leaps up where they clear the most
         style = {"color": colors[index % len(colors)], "lw": 1.8 if index == 0 else 1.1}
-        axes[0].plot(root[:, 0] - root[apex, 0], root[:, 2], label=clip.name, **style)
+        name = textwrap.fill(clip.name, _LINE)
+        axes[0].plot(root[:, 0] - root[apex, 0], root[:, 2], label=name, **style)
         axes[1].plot(times - times[apex], pitch_angles(clip), **style)
         axes[2].plot(
             times - times[apex], lowest[:, list(clip.robot.front_legs)].min(axis=1), **style
@@ -124,9 +126,8 @@ def compare(clips: Sequence[Clip], path: str | Path, source: str = "") -> None:
         axes[1:], ("nose-up pitch (deg)", "front feet (m)", "hind feet (m)"), strict=True
     ):
         axis.set_ylabel(label)
-    axes[3].set_xlabel(
-        "time from the top of the leap (s)" + (f"; other clips: {source}" if source else "")
-    )
+    label = "time from the top of the leap (s)" + (f"; other clips: {source}" if source else "")
+    axes[3].set_xlabel(textwrap.fill(label, _LINE))
     for axis in axes:
         axis.spines[["top", "right"]].set_visible(False)
     _save(figure, Path(path))
