@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from twirl_mjx import assets, cli
+from twirl_mjx.commands import bench
 
 # An audit hook sees every file that is opened. jax is allowed to be imported, not to start a
 # device: `backends_are_initialized` is what jax itself asks before it may change platforms.
@@ -110,8 +111,11 @@ def heavy_imports(lines: list[str]) -> list[str]:
 
 def test_help_and_refusals_of_every_command_import_nothing_heavy(tmp_path: Path) -> None:
     """A first word and a typo are answered at once: what simulates is loaded after the options."""
-    nested = ("runs list", "runs prune", "clip make", "clip show", "clip check")
+    nested = [f"runs {name}" for name in ("list", "show", "compare", "prune")]
+    nested += [f"clip {name}" for name in ("make", "show", "check")]
+    nested += [f"bench {part}" for part in (*bench.PARTS, *bench.ALONE)]
     lines = [f"{name} --help" for name in (*cli.COMMANDS, *nested)]
+    lines += [f"{name} --hlep" for name in nested]
     lines += [f"{name} --taks biped" for name in cli.COMMANDS]
     lines += ["train --task bipd", "train --num-envs 0", "evaluate zero --shifts icey", "hlep",
               f"runs --runs {tmp_path}", f"runs --runs {tmp_path} --status finished"]  # fmt: skip

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from twirl_mjx.droq import learner, losses, networks
-from twirl_mjx.droq.forms import FORMS, settings_of
+from twirl_mjx.droq.config import settings_of
+from twirl_mjx.droq.forms import FORMS
 from twirl_mjx.droq.state import CriticState
 
 OBS_SIZE, ACTION_SIZE, U = 5, 2, 4

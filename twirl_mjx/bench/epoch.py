@@ -7,7 +7,6 @@ add up to it; ``unaccounted_s`` is the difference.
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import resource
 import sys
@@ -18,7 +17,6 @@ import jax
 import jax.numpy as jnp
 
 from twirl_mjx.bench.measure import (
-    DEFAULT_TASK,
     Chain,
     Record,
     machine,
@@ -26,16 +24,14 @@ from twirl_mjx.bench.measure import (
     sample_rates,
     summary,
 )
-from twirl_mjx.checks import check_choice, check_range
+from twirl_mjx.bench.options import EpochBench
 from twirl_mjx.droq import learner as droq
 from twirl_mjx.droq.config import DroqConfig
 from twirl_mjx.replay import mixed, ring
 from twirl_mjx.sim import actuation
 from twirl_mjx.sim.engine import resolve_engine
-from twirl_mjx.tasks.registry import TASKS
 from twirl_mjx.training import state as training
 from twirl_mjx.training.config import TrainConfig
-from twirl_mjx.training.presets import PRESETS, make_config
 from twirl_mjx.training.state import TrainState
 from twirl_mjx.worlds.make import make_env
 from twirl_mjx.worlds.vector import VectorEnv, make_transition
@@ -45,43 +41,6 @@ REPEATS = 20
 
 Part = Callable[[Any], Any]
 """A function of its own last result."""
-
-
-@dataclasses.dataclass(frozen=True)
-class EpochBench:
-    """Split the cost of a training epoch, from scratch, after the warm-up."""
-
-    json: bool = False
-    """Print one JSON document on stdout, and nothing else."""
-    seconds: float = 24.0
-    """Length of all measurements together in s, without compilation."""
-    task: str = DEFAULT_TASK
-    """Task."""
-    preset: str = "cpu"
-    """Sizes: paper, cpu, massive or debug."""
-
-    def __post_init__(self) -> None:
-        """Check names and numbers.
-
-        Raises:
-            ValueError: Unknown name, or a value out of range.
-        """
-        check_choice("task", self.task, TASKS.names())
-        check_choice("preset", self.preset, PRESETS)
-        check_range("seconds", self.seconds, 0.1, 3600.0)
-
-    @property
-    def config(self) -> TrainConfig:
-        """The run: the preset's shapes with epochs short enough to be timed several times."""
-        base = make_config(self.task, self.preset)
-        worlds = base.num_envs
-        steps = max(1, min(base.steps_per_epoch, 640 // max(1, base.updates_per_step)))
-        return dataclasses.replace(
-            base,
-            variant="scratch",
-            warmup_env_steps=worlds,
-            epoch_env_steps=steps * worlds,
-        )
 
 
 def repeat(part: Part) -> Part:

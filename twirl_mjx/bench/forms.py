@@ -7,69 +7,15 @@ what must agree is where the seeds of a form and those of the plain one lie.
 
 from __future__ import annotations
 
-import dataclasses
 import time
-from typing import Any
 
 import jax
 import numpy as np
 
-from twirl_mjx.bench.measure import DEFAULT_TASK, Record, machine, progress
-from twirl_mjx.checks import check_choice, check_range
-from twirl_mjx.tasks.registry import TASKS
+from twirl_mjx.bench.measure import Record, machine, progress
+from twirl_mjx.bench.options import QUARTERS, FormsBench
 from twirl_mjx.training import seeds
-from twirl_mjx.training.config import TrainConfig
-from twirl_mjx.training.presets import PRESETS, make_config
 from twirl_mjx.worlds.make import make_env
-
-FORMS: dict[str, dict[str, Any]] = {
-    "plain": {"fast": False},
-    "fast": {"fast": True},
-    "bfloat16": {"fast": True, "matmul_dtype": "bfloat16"},
-}
-"""Settings of the learner (``DroqConfig``); every form is compared with the first one."""
-QUARTERS = 4
-"""Parts of the run whose mean returns are compared."""
-
-
-@dataclasses.dataclass(frozen=True)
-class FormsBench:
-    """Train with every form of the learner and compare the returns, minutes."""
-
-    json: bool = False
-    """Print one JSON document on stdout, and nothing else."""
-    task: str = DEFAULT_TASK
-    """Task, trained from scratch."""
-    preset: str = "cpu"
-    """Sizes: paper, cpu, massive or debug."""
-    seeds: int = 3
-    """Seeds, one program."""
-    env_steps: int = 48_000
-    """Transitions of each seed, rounded down to whole epochs."""
-    forms: tuple[str, ...] = tuple(FORMS)[1:]
-    """Forms to compare with the plain one; bfloat16 is slow where the hardware lacks it."""
-
-    def __post_init__(self) -> None:
-        """Check names and numbers.
-
-        Raises:
-            ValueError: Unknown name, or a value out of range.
-        """
-        check_choice("task", self.task, TASKS.names())
-        check_choice("preset", self.preset, PRESETS)
-        if not self.forms:
-            raise ValueError(f"forms is empty, expected some of {', '.join(tuple(FORMS)[1:])}")
-        for form in self.forms:
-            check_choice("form", form, tuple(FORMS)[1:])
-        check_range("seeds", self.seeds, 2, 1000)
-        epoch = self.config("fast").steps_per_epoch * self.config("fast").num_envs
-        check_range("env_steps", self.env_steps, QUARTERS * epoch, 10**9)
-
-    def config(self, form: str) -> TrainConfig:
-        """Return the run with one form of the learner."""
-        base = make_config(self.task, self.preset)
-        droq = dataclasses.replace(base.droq, **FORMS[form])
-        return dataclasses.replace(base, variant="scratch", droq=droq)
 
 
 def returns_of(options: FormsBench, form: str) -> tuple[np.ndarray, int, float]:

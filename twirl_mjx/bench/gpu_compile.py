@@ -14,29 +14,26 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from twirl_mjx.bench.gpu_target import CARDS, compile_for, compiler_missing
+from twirl_mjx.bench.gpu_target import compile_for, compiler_missing
 from twirl_mjx.bench.measure import Record, machine, progress
+from twirl_mjx.bench.options import GpuCompileBench
 from twirl_mjx.bench.thunks import Block
-from twirl_mjx.checks import check_choice, check_range
 from twirl_mjx.droq import forms, learner
-from twirl_mjx.droq.config import DroqConfig
+from twirl_mjx.droq.config import DroqConfig, settings_of
 from twirl_mjx.droq.state import CriticState
 from twirl_mjx.replay import ring
 from twirl_mjx.sim import mjx
 from twirl_mjx.sim.actuation import MotorCommand
 from twirl_mjx.sim.dynamics import Dynamics
 from twirl_mjx.sim.engine import Trace
-from twirl_mjx.tasks.registry import TASKS
 from twirl_mjx.training import seeds as batch
 from twirl_mjx.training import state as training
 from twirl_mjx.training.config import TrainConfig
 from twirl_mjx.training.presets import make_config
 from twirl_mjx.types import Transition
-from twirl_mjx.worlds.config import WorldConfig
 from twirl_mjx.worlds.make import make_env
 from twirl_mjx.worlds.vector import VectorEnv
 
-PROGRAMS = ("block", "update", "epoch", "worlds")
 BLOCK, ROWS, OBS, ACTION = 20, 256, 101, 12
 """Critic updates of a block, rows of a minibatch, sizes of ``biped``: the paper's."""
 STEPS = 20
@@ -44,61 +41,6 @@ STEPS = 20
 
 Task = tuple[Callable[..., Any], tuple[Any, ...], tuple[int, ...]]
 """Function, shapes of its arguments, arguments it may overwrite."""
-
-
-@dataclasses.dataclass(frozen=True)
-class GpuCompileBench:
-    """Compile for a GPU that is not there; count operations per loop body (minutes)."""
-
-    json: bool = False
-    """Print one JSON document on stdout, and nothing else."""
-    programs: tuple[str, ...] = PROGRAMS
-    """block (critic updates), update (with actor and temperature), epoch (without physics), worlds
-    (MJX)."""
-    forms: tuple[str, ...] = tuple(forms.FORMS)
-    """Forms of the learner: plain, fast, accelerator, kernels."""
-    seeds: tuple[int, ...] = (1, 8)
-    """Learners in one program."""
-    num_envs: int = 1024
-    """Worlds of the program worlds."""
-    task: str = WorldConfig.task
-    """Task of epoch and worlds."""
-    card: str = "h100"
-    """Card to compile for: h100 or h200."""
-    flags: tuple[str, ...] = ()
-    """Flags of XLA, as xla_gpu_enable_command_buffer=+WHILE."""
-
-    def __post_init__(self) -> None:
-        """Check names and numbers.
-
-        Raises:
-            ValueError: Unknown name, or a value out of range.
-        """
-        for name, values, known in (
-            ("programs", self.programs, PROGRAMS),
-            ("forms", self.forms, tuple(forms.FORMS)),
-            ("seeds", self.seeds, ()),
-        ):
-            if not values:
-                raise ValueError(f"{name} needs at least one value")
-            for value in values:
-                if known:
-                    check_choice(name, str(value), known)
-                else:
-                    check_range(name, float(value), 1, 1000)
-        check_choice("task", self.task, TASKS.names())
-        check_choice("card", self.card, tuple(CARDS))
-        check_range("num_envs", self.num_envs, 1, 1_000_000)
-        for flag in self.flags:
-            if "=" not in flag:
-                raise ValueError(f"flag {flag!r} has no value (nearest: {flag + '=true'!r})")
-
-    @property
-    def options(self) -> dict[str, Any]:
-        """Flags of XLA by name."""
-        pairs = (flag.removeprefix("--").split("=", 1) for flag in self.flags)
-        words = {"true": True, "false": False}
-        return {name: words.get(value, value) for name, value in pairs}
 
 
 class Still:
@@ -122,7 +64,7 @@ class Still:
 
 def learner_program(program: str, form: str, seeds: int) -> Task:
     """Return a block of critic updates, or a whole update, of one learner or of several."""
-    config = DroqConfig(**forms.settings_of(form))
+    config = DroqConfig(**settings_of(form))
 
     def spec(*shape: int, dtype: Any = jnp.float32) -> Any:
         return jax.ShapeDtypeStruct(shape, dtype)
@@ -156,7 +98,7 @@ def learner_program(program: str, form: str, seeds: int) -> Task:
 def epoch_program(options: GpuCompileBench, form: str, seeds: int) -> Task:
     """Return an epoch of the paper's preset with everything but physics."""
     base = make_config(options.task, "paper")
-    config = dataclasses.replace(base, engine="mjx", droq=DroqConfig(**forms.settings_of(form)))
+    config = dataclasses.replace(base, engine="mjx", droq=DroqConfig(**settings_of(form)))
     env = make_env(config)
     env.engine = Still(env.scene.options.n_substeps)
     source = None

@@ -23,11 +23,8 @@ from typing import Any
 from twirl_mjx import files
 from twirl_mjx.bench import parity
 from twirl_mjx.bench.measure import Record, progress, summary
+from twirl_mjx.bench.options import GpuProofBench
 from twirl_mjx.bench.worker import Worker
-from twirl_mjx.checks import check_choice, check_range
-from twirl_mjx.tasks.registry import TASKS
-from twirl_mjx.training.presets import PRESETS
-from twirl_mjx.worlds.config import WorldConfig
 
 PARITY, TIMINGS, TRAINING, MACHINE = "parity.csv", "timings.csv", "training.csv", "machine.json"
 """What a proof leaves in its folder, beside the runs of the training."""
@@ -60,40 +57,6 @@ class Variant:
     def unit(self) -> str:
         """What its rate counts."""
         return {"learner": "critic updates/s", "worlds": "control steps/s"}[self.kind]
-
-
-@dataclasses.dataclass(frozen=True)
-class GpuProofBench:
-    """Check and time a GPU, then train on it until the time is over; goes on where it stopped."""
-
-    json: bool = False
-    """Print one JSON document on stdout, and nothing else."""
-    minutes: float = 9.0
-    """Time for everything."""
-    out: Path = Path("runs/gpu-proof")
-    """Folder of the results; a second call goes on from what is there."""
-    task: str = WorldConfig.task
-    """Task of the training."""
-    preset: str = "cpu"
-    """Settings of the training; those of cpu reach a result soonest."""
-    seeds: int = 8
-    """Seeds of the training, one program."""
-    seconds: float = 3.0
-    """Length of each timing in s."""
-    tiny: bool = False
-    """Small networks and few variants: to try the command itself, on any machine."""
-
-    def __post_init__(self) -> None:
-        """Check names and numbers.
-
-        Raises:
-            ValueError: Unknown name, or a value out of range.
-        """
-        check_choice("task", self.task, TASKS.names())
-        check_choice("preset", self.preset, PRESETS)
-        check_range("minutes", self.minutes, 0.1, 600.0)
-        check_range("seeds", self.seeds, 1, 1000)
-        check_range("seconds", self.seconds, 0.1, 600.0)
 
 
 def variants(options: GpuProofBench) -> list[Variant]:

@@ -2,24 +2,10 @@
 
 from __future__ import annotations
 
-import dataclasses
-from pathlib import Path
-
 from twirl_mjx import files
 from twirl_mjx.bench import gpu_proof, report
 from twirl_mjx.bench.measure import Record
-
-
-@dataclasses.dataclass(frozen=True)
-class GpuTableBench:
-    """Write the results of a GPU into a page."""
-
-    json: bool = False
-    """Print one JSON document on stdout, and nothing else."""
-    results: Path = Path("runs/gpu-proof")
-    """Folder of ``twirl bench gpu-proof``."""
-    page: Path = Path("docs/accelerators.md")
-    """Markdown page whose marked section is replaced."""
+from twirl_mjx.bench.options import GpuTableBench
 
 
 def measure(options: GpuTableBench) -> Record:

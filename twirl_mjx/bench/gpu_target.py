@@ -18,6 +18,7 @@ import jax
 
 from twirl_mjx import files
 from twirl_mjx.bench import thunks
+from twirl_mjx.bench.options import CARDS
 from twirl_mjx.checks import check_choice
 
 PLUGINS = ("jax_plugins.xla_cuda13", "jax_plugins.xla_cuda12")
@@ -46,20 +47,6 @@ HOPPER: Mapping[str, int | float] = {
 }
 """Limits of compute capability 9.0 (CUDA C++ Programming Guide, technical specifications) and of
 the SXM5 boards (NVIDIA H100 data sheet): what the compiler's cost model asks for."""
-
-CARDS: dict[str, Mapping[str, Any]] = {
-    "h100": {
-        "name": "NVIDIA H100 80GB HBM3",
-        "memory_bandwidth": 3_350_000_000_000,
-        "device_memory_size": 80 * 10**9,
-    },
-    "h200": {
-        "name": "NVIDIA H200",
-        "memory_bandwidth": 4_800_000_000_000,
-        "device_memory_size": 141 * 10**9,
-    },
-}
-"""Card -> name, bytes/s and bytes of memory (NVIDIA data sheets)."""
 
 
 @dataclasses.dataclass(frozen=True)

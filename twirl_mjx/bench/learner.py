@@ -11,7 +11,7 @@ import dataclasses
 import json
 import subprocess
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -26,11 +26,10 @@ from twirl_mjx.bench.measure import (
     sample_rates,
     summary,
 )
+from twirl_mjx.bench.options import LearnerBench
 from twirl_mjx.bench.worker import Worker, pinning_missing
-from twirl_mjx.checks import check_choice, check_range
 from twirl_mjx.droq import forms
 from twirl_mjx.droq import learner as droq
-from twirl_mjx.droq.config import DroqConfig
 from twirl_mjx.machine import usable_cores
 from twirl_mjx.replay import mixed, ring
 
@@ -38,74 +37,6 @@ ROWS = 50_000
 """Transitions in the replay, as in the SBX peer."""
 BLOCKS = 4
 """Blocks of updates in one compiled call."""
-
-
-@dataclasses.dataclass(frozen=True)
-class LearnerBench:
-    """Measure critic updates per second; the defaults are the paper's sizes on ``biped``."""
-
-    json: bool = False
-    """Print one JSON document on stdout, and nothing else."""
-    seconds: float = 60.0
-    """Length of all measurements together in s, without compilation."""
-    rounds: int = 2
-    """Times that everything is measured in turn."""
-    obs: int = 101
-    """Length of an observation."""
-    action: int = 12
-    """Length of an action."""
-    batch: int = 256
-    """Rows of a minibatch."""
-    utd: int = 20
-    """Critic updates per update of the actor."""
-    hidden: int = 256
-    """Units of each of the two hidden layers."""
-    seeds: int | None = None
-    """Learners in one program (a vmap axis); as many as CPUs by default, at least 2."""
-    workers: int | None = None
-    """Learners in processes pinned to one CPU each; as many as CPUs by default, 0 for none."""
-    form: Literal["auto", "plain", "fast", "accelerator", "kernels"] = "auto"
-    """Form of the update: the plain flax/optax one, fast (CPUs), accelerator (GPUs and TPUs),
-    kernels (GPUs); auto is the one of the machine."""
-    matmul_dtype: Literal["float32", "bfloat16"] = "float32"
-    """Precision of matrix products (SBX always uses float32)."""
-    sbx: bool = True
-    """Measure SBX's DroQ too, if its environment ``.venv-bench`` exists."""
-
-    def __post_init__(self) -> None:
-        """Check every number.
-
-        Raises:
-            ValueError: A value is out of range.
-        """
-        check_range("seconds", self.seconds, 0.1, 3600.0)
-        for name in ("rounds", "obs", "action", "batch", "utd", "hidden"):
-            check_range(name, getattr(self, name), 1, 1_000_000)
-        check_choice("form", self.form, ("auto", *forms.FORMS))
-        check_range("seeds", self.num_seeds, 1, 1000)
-        check_range("workers", self.num_workers, 0, len(usable_cores()))
-
-    @property
-    def num_seeds(self) -> int:
-        """Learners on the batch axis."""
-        return max(2, len(usable_cores())) if self.seeds is None else self.seeds
-
-    @property
-    def num_workers(self) -> int:
-        """Pinned learners."""
-        return len(usable_cores()) if self.workers is None else self.workers
-
-    @property
-    def droq(self) -> DroqConfig:
-        """Settings of the learner."""
-        return DroqConfig(
-            hidden_sizes=(self.hidden, self.hidden),
-            batch_size=self.batch,
-            utd=float(self.utd),
-            updates_per_block=self.utd,
-            matmul_dtype=self.matmul_dtype,
-            **forms.settings_of(self.form),
-        )
 
 
 def random_ring(options: LearnerBench, seeds: int) -> ring.RingBuffer:

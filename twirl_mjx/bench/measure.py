@@ -19,8 +19,6 @@ from twirl_mjx import files
 from twirl_mjx.machine import usable_cores
 from twirl_mjx.training.rundir import versions
 
-DEFAULT_TASK = "stand"
-"""Task of measurements that name none: the cheapest."""
 MIN_SAMPLES = 3
 MAX_SAMPLE_S = 1.0
 """s, length of one sample unless a single call takes longer."""

@@ -20,9 +20,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from twirl_mjx import array_files
-from twirl_mjx.bench.measure import DEFAULT_TASK
+from twirl_mjx.bench.options import DEFAULT_TASK
 from twirl_mjx.droq import forms, learner
-from twirl_mjx.droq.config import DroqConfig
+from twirl_mjx.droq.config import DroqConfig, settings_of
 from twirl_mjx.training import state as training
 from twirl_mjx.training.presets import make_config
 from twirl_mjx.types import Transition
@@ -57,7 +57,7 @@ def learner_numbers() -> Numbers:
     out: Numbers = {}
     for form in forms.FORMS:
         config = DroqConfig(hidden_sizes=(64, 64), batch_size=ROWS, updates_per_block=UPDATES)
-        config = dataclasses.replace(config, **forms.settings_of(form))
+        config = dataclasses.replace(config, **settings_of(form))
         old = learner.init(jax.random.key(0), config, OBS, ACTION)
         update = jax.jit(learner.update, static_argnums=1)
         new, metrics = update(old, config, minibatches, jax.random.key(1))

@@ -7,7 +7,6 @@ a short warm-up and short epochs; neither changes what is compiled. It counts as
 
 from __future__ import annotations
 
-import dataclasses
 import os
 import statistics
 import subprocess
@@ -17,39 +16,11 @@ import time
 from pathlib import Path
 
 from twirl_mjx import files
-from twirl_mjx.bench.measure import DEFAULT_TASK, Record, machine, progress
-from twirl_mjx.checks import check_choice, check_range
-from twirl_mjx.tasks.registry import TASKS
-from twirl_mjx.training.presets import PRESETS, make_config
+from twirl_mjx.bench.measure import Record, machine, progress
+from twirl_mjx.bench.options import StartupBench
+from twirl_mjx.training.presets import make_config
 
 POLL_S = 0.05
-
-
-@dataclasses.dataclass(frozen=True)
-class StartupBench:
-    """Measure the time to the first critic updates, from the shell."""
-
-    json: bool = False
-    """Print one JSON document on stdout, and nothing else."""
-    task: str = DEFAULT_TASK
-    """Task, trained from scratch."""
-    preset: str = "cpu"
-    """Sizes: paper, cpu, massive or debug."""
-    repeats: int = 2
-    """Starts with a filled cache."""
-    seconds: float = 300.0
-    """s, longest start that is waited for."""
-
-    def __post_init__(self) -> None:
-        """Check names and numbers.
-
-        Raises:
-            ValueError: Unknown name, or a value out of range.
-        """
-        check_choice("task", self.task, TASKS.names())
-        check_choice("preset", self.preset, PRESETS)
-        check_range("repeats", self.repeats, 1, 100)
-        check_range("seconds", self.seconds, 1.0, 36_000.0)
 
 
 def command(options: StartupBench, runs: Path) -> list[str]:

@@ -7,14 +7,12 @@ and auto-resets.
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import importlib.util
 import statistics
 import time
 from collections.abc import Callable, Sequence
-from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -23,7 +21,6 @@ import numpy as np
 
 from twirl_mjx import files
 from twirl_mjx.bench.measure import (
-    DEFAULT_TASK,
     Chain,
     Record,
     machine,
@@ -32,11 +29,10 @@ from twirl_mjx.bench.measure import (
     sample_rates,
     summary,
 )
-from twirl_mjx.checks import check_choice, check_range
+from twirl_mjx.bench.options import WorldsBench
 from twirl_mjx.machine import usable_cores
 from twirl_mjx.sim import mjx
 from twirl_mjx.sim.engine import resolve_engine
-from twirl_mjx.tasks.registry import TASKS
 from twirl_mjx.worlds.make import make
 from twirl_mjx.worlds.vector import EnvState, VectorEnv
 
@@ -46,45 +42,6 @@ WARMUP_CALLS = 3
 """Calls before anything is timed, after which episodes end at different times."""
 HEADLINE_WORLDS = 128
 """The row whose numbers stand at the top of the record, of the engine that ``auto`` chooses."""
-
-
-@dataclasses.dataclass(frozen=True)
-class WorldsBench:
-    """Measure worlds with random actions, beside their bare physics."""
-
-    json: bool = False
-    """Print one JSON document on stdout, and nothing else."""
-    seconds: float = 40.0
-    """Length of all measurements together in s, without compilation."""
-    limit: float = 270.0
-    """s, no further row is started after this time; rows that are left out say so."""
-    engine: Literal["both", "mjx", "native"] = "both"
-    """Physics engine."""
-    keep: Path | None = None
-    """Write the JSON document here after every row, for a caller that may end this."""
-    num_envs: tuple[int, ...] = (1, 16, 128, 1024)
-    """Numbers of worlds stepped together."""
-    task: str = DEFAULT_TASK
-    """Task."""
-
-    def __post_init__(self) -> None:
-        """Check names and numbers.
-
-        Raises:
-            ValueError: A value is out of range.
-        """
-        check_choice("task", self.task, TASKS.names())
-        check_range("seconds", self.seconds, 0.1, 3600.0)
-        check_range("limit", self.limit, 0.0, 1e6)
-        if not self.num_envs:
-            raise ValueError("num_envs needs at least one number of worlds")
-        for number in self.num_envs:
-            check_range("num_envs", number, 1, 1_000_000)
-
-    @property
-    def engines(self) -> tuple[str, ...]:
-        """Engines to measure."""
-        return ("native", "mjx") if self.engine == "both" else (self.engine,)
 
 
 def random_steps(env: VectorEnv, state: tuple[EnvState, jax.Array]) -> Any:

@@ -19,6 +19,7 @@ from typing import Any
 from twirl_mjx import files
 from twirl_mjx.checks import check_choice, check_range
 from twirl_mjx.commands.console import json_text, parse, say
+from twirl_mjx.commands.waiting import waiting
 from twirl_mjx.sweep import launch
 
 PARTS = ("learner", "startup", "epoch", "worlds")
@@ -98,12 +99,15 @@ def main(argv: list[str]) -> int:
 
 def _part(name: str, argv: list[str]) -> int:
     """Measure one part and print its table, or its record as JSON."""
-    from twirl_mjx.bench import report
-    from twirl_mjx.bench.measure import only_json_on_stdout
+    from twirl_mjx.bench import options as asked
 
-    module: Any = importlib.import_module(f"twirl_mjx.bench.{name.replace('-', '_')}")
     kind = "".join(word.capitalize() for word in (*name.split("-"), "bench"))
-    options = parse(getattr(module, kind), argv, f"twirl bench {name}")
+    options = parse(getattr(asked, kind), argv, f"twirl bench {name}")
+    with waiting("loading jax"):
+        from twirl_mjx.bench import report
+        from twirl_mjx.bench.measure import only_json_on_stdout
+
+        module: Any = importlib.import_module(f"twirl_mjx.bench.{name.replace('-', '_')}")
     with only_json_on_stdout() as out:
         record = module.measure(options)
         if options.json:

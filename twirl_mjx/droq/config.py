@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from typing import Literal
+from typing import Any, Literal
 
 from twirl_mjx.checks import check_choice, check_range
+
+FORM_NAMES = ("plain", "fast", "accelerator", "kernels")
+"""Names of the forms of the update, see ``droq.forms``."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -61,7 +64,7 @@ class DroqConfig:
         if self.target_entropy is not None:
             check_range("droq.target_entropy", self.target_entropy, -1e4, 1e4)
         check_choice("droq.matmul_dtype", self.matmul_dtype, ("float32", "bfloat16"))
-        check_choice("droq.form", self.form, ("auto", "fast", "accelerator", "kernels"))
+        check_choice("droq.form", self.form, ("auto", *FORM_NAMES[1:]))
         if not self.hidden_sizes or min(self.hidden_sizes) < 1:
             nearest = tuple(max(1, size) for size in self.hidden_sizes or (128, 128))
             raise ValueError(
@@ -85,3 +88,8 @@ class DroqConfig:
                 f"droq.form kernels needs a batch size that is a multiple of 16, not"
                 f" {self.batch_size} (nearest: {nearest})"
             )
+
+
+def settings_of(form: str) -> dict[str, Any]:
+    """Return the settings of ``DroqConfig`` that mean a form wherever jax runs."""
+    return {"fast": False} if form == "plain" else {"fast": True, "form": form}

@@ -3,19 +3,14 @@
 from __future__ import annotations
 
 from types import ModuleType
-from typing import Any
 
 import jax
 
 from twirl_mjx.droq import accelerator, fast, kernels, plain
-from twirl_mjx.droq.config import DroqConfig
+from twirl_mjx.droq.config import FORM_NAMES, DroqConfig
 
-FORMS: dict[str, ModuleType] = {
-    "plain": plain,
-    "fast": fast,
-    "accelerator": accelerator,
-    "kernels": kernels,
-}
+_MODULES = (plain, fast, accelerator, kernels)
+FORMS: dict[str, ModuleType] = dict(zip(FORM_NAMES, _MODULES, strict=True))
 """Name -> module with ``critic_q`` and ``critic_block``."""
 
 
@@ -26,11 +21,6 @@ def name_of(config: DroqConfig) -> str:
     if config.form != "auto":
         return config.form
     return "fast" if jax.default_backend() == "cpu" else "accelerator"
-
-
-def settings_of(form: str) -> dict[str, Any]:
-    """Return the settings of ``DroqConfig`` that mean a form wherever jax runs."""
-    return {"fast": False} if form == "plain" else {"fast": True, "form": form}
 
 
 def form_of(config: DroqConfig) -> ModuleType:
