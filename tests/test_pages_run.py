@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import contextlib
 import importlib
+import importlib.util
 import json
 import os
 import re
@@ -12,6 +13,7 @@ import shlex
 import subprocess
 import sys
 import textwrap
+import types
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -194,6 +196,24 @@ def test_the_notebook_was_executed_and_is_small() -> None:
     kinds = {kind for output in outputs for kind in output.get("data", {})}
     assert {"image/png", "text/html"} <= kinds  # the curves and the film
     assert "/root" not in NOTEBOOK.read_text() and "/tmp" not in NOTEBOOK.read_text()
+
+
+def test_the_notebook_installs_the_package_where_it_is_missing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In Colab the wheel comes by upload; in a checkout nothing happens."""
+    called: list[list[str]] = []
+    wheel = "twirl_mjx-0.2.0-py3-none-any.whl"
+    files = types.SimpleNamespace(upload=Path(wheel).touch)
+    install = "".join(cells()[0]["source"])
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(subprocess, "check_call", called.append)
+    exec(install, {})
+    assert called == []
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setitem(sys.modules, "google.colab", types.SimpleNamespace(files=files))
+    exec(install, {})
+    assert [command[1:] for command in called] == [["-m", "pip", "install", "--quiet", wheel]]
 
 
 @pytest.mark.slow

@@ -89,6 +89,14 @@ def test_a_closing_value_alone_is_no_curve(tmp_path, write, rows_of):
     assert {d.metric for d in plots.drawings("mine", curves, None)} == {"eval/return"}
 
 
+def test_what_only_runs_without_the_setting_report_has_no_effect(tmp_path, write, rows_of):
+    rows = [r for phi in (0, 0.5) for r in rows_of("biped", "icy", "twirl", 0, extra=(phi,))]
+    rows += rows_of("biped", "icy", "zero-shot", 0, extra=("",), standing=True)
+    write(tmp_path / "a.csv", [*tables.CURVE_COLUMNS, "phi"], rows)
+    curves, _ = tables.read_directory(tmp_path)
+    assert {d.metric for d in plots.drawings("mine", curves, None)} == {"return"}
+
+
 def test_two_settings_have_an_effect_each(tmp_path, write, rows_of):
     rows = [
         row

@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from twirl_mjx.commands import sweep, sweep_run
+from twirl_mjx.commands import figures, report, sweep, sweep_run
 from twirl_mjx.figures.tables import read_table
 from twirl_mjx.sweep import estimate, scheduler
 from twirl_mjx.sweep.grid import load
@@ -90,6 +90,24 @@ def test_tables_hold_more_than_what_was_asked_for(
     assert gathered("--arms", "*phi0.5", "--seeds", "0") == all_arms
     assert gathered("--arms", "*phi0.5", "--seeds", "4") == all_arms | {"biped-phi0.5": 3}
     assert "phi: 6 of 6 cells finished; 6 tables" in capsys.readouterr().out
+
+
+def test_tables_and_figures_lie_where_the_user_is(
+    grid_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, finish_run: Finish
+) -> None:
+    """A grid of one's own, anywhere: nothing is written into the checkout this code is in."""
+    here = tmp_path / "mine"
+    here.mkdir()
+    monkeypatch.chdir(here)
+    for cell in make_plan(load(str(grid_file)), here / "runs"):
+        finish_run(cell, here / "runs")
+    assert sweep.main([str(grid_file), "--gather-only"]) == 0
+    assert (here / "results" / "phi" / "biped-phi0.5.csv").is_file()
+    assert {path.name for path in here.iterdir()} == {"results", "runs"}
+    shown = (figures.FiguresOptions, report.ReportOptions)
+    assert [options().results for options in shown] == [Path("results")] * 2
+    (here / "experiments").mkdir()  # a checkout
+    assert [options().results for options in shown] == [Path("experiments/results")] * 2
 
 
 def test_estimates_use_what_was_measured(

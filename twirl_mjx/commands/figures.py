@@ -7,6 +7,7 @@ from pathlib import Path
 
 from twirl_mjx import files
 from twirl_mjx.commands.console import parse, say
+from twirl_mjx.commands.tables import results_folder
 from twirl_mjx.commands.waiting import waiting
 
 
@@ -14,8 +15,8 @@ from twirl_mjx.commands.waiting import waiting
 class FiguresOptions:
     """Rebuild all figures, and the numbers of pages, from the committed tables; needs no jax."""
 
-    results: Path = Path("experiments/results")
-    """Folder with <grid>/<arm>.csv."""
+    results: Path = dataclasses.field(default_factory=results_folder)
+    """Folder with <grid>/<arm>.csv: experiments/results of a checkout, elsewhere results."""
     out: Path = Path("runs/figures")
     """Folder of the pictures."""
     shown: Path = Path("docs/images/results")

@@ -11,6 +11,7 @@ import tyro
 
 from twirl_mjx import files
 from twirl_mjx.commands.console import parse, say
+from twirl_mjx.commands.tables import results_folder
 from twirl_mjx.commands.waiting import waiting
 from twirl_mjx.training.overview import find
 
@@ -23,8 +24,8 @@ class ReportOptions:
     """Runs by name, pattern, path or condition such as task:biped; without them the tables."""
     runs: Path = Path("runs")
     """Folder of all runs."""
-    results: Path = Path("experiments/results")
-    """Folder with <grid>/<arm>.csv."""
+    results: Path = dataclasses.field(default_factory=results_folder)
+    """Folder with <grid>/<arm>.csv: experiments/results of a checkout, elsewhere results."""
     out: Path = Path("runs/report.html")
     """The page."""
     media: tuple[Path, ...] = ()

@@ -10,6 +10,7 @@ import tyro
 
 from twirl_mjx.checks import check_range
 from twirl_mjx.commands.console import parse
+from twirl_mjx.commands.tables import results_folder
 
 
 @dataclasses.dataclass(frozen=True)
@@ -30,8 +31,8 @@ class SweepOptions:
     """Finished nominal runs that adaptation starts from, one per task; the grid's by default."""
     runs: Path = Path("runs")
     """Folder of all runs; on a cluster one that all machines share."""
-    results: Path | None = None
-    """Folder of the tables; experiments/results by default."""
+    results: Path = dataclasses.field(default_factory=results_folder)
+    """Folder of the tables: experiments/results in a checkout, elsewhere results."""
     gather_only: bool = False
     """Only write the tables of what is finished."""
     workers: int | None = None

@@ -14,7 +14,7 @@ from twirl_mjx.commands.console import say
 from twirl_mjx.commands.sweep import SweepOptions
 from twirl_mjx.machine import runtime_folder
 from twirl_mjx.sweep import estimate, gather, plan
-from twirl_mjx.sweep.grid import Grid, grids_folder, load
+from twirl_mjx.sweep.grid import Grid, load
 from twirl_mjx.sweep.scheduler import Progress, RayExecutor, run_all
 from twirl_mjx.sweep.table import SweepView, plan_table
 from twirl_mjx.sweep.together import make_teams
@@ -36,7 +36,7 @@ def sweep(options: SweepOptions) -> int:
     runs = options.runs.resolve()
     if not options.dry_run:
         runtime_folder()  # refused here rather than by every worker
-        for folder in (runs, gather.tables_folder(grid, runs, _results(options))):
+        for folder in (runs, gather.tables_folder(grid, runs, options.results)):
             files.check_target(folder / "any")
     plan.make_plan(joined(whole, grid), runs, options.nominal)  # refused now, not when gathered
     cells = plan.make_plan(grid, runs, options.nominal)
@@ -62,20 +62,15 @@ def sweep(options: SweepOptions) -> int:
     return code
 
 
-def _results(options: SweepOptions) -> Path:
-    return options.results or grids_folder() / "results"
-
-
 def _gather(grid: Grid, runs: Path, options: SweepOptions) -> None:
     """Write the tables of all arms, not only of those that were asked for, and say so."""
     cells = plan.make_plan(grid, runs, options.nominal)
-    results = _results(options)
-    written = gather.gather(grid, cells, runs, results)
+    written = gather.gather(grid, cells, runs, options.results)
     arms = [cell for cell in cells if cell.arm]
     finished = sum(plan.is_finished(cell, runs) for cell in arms)
     say(
         f"{grid.results_name}: {finished} of {len(arms)} cells finished;"
-        f" {len(written)} tables in {gather.tables_folder(grid, runs, results)}"
+        f" {len(written)} tables in {gather.tables_folder(grid, runs, options.results)}"
     )
 
 

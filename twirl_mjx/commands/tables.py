@@ -1,4 +1,4 @@
-"""Tables of episodes that commands write: whose rows, which further columns."""
+"""Tables that commands write and read: where they are, whose rows, which further columns."""
 
 from __future__ import annotations
 
@@ -8,6 +8,11 @@ from pathlib import Path
 
 from twirl_mjx import files
 from twirl_mjx.checks import check_printable
+
+
+def results_folder() -> Path:
+    """Return where tables of grids are: of the checkout that the user is in, else ``results``."""
+    return Path("experiments/results") if Path("experiments").is_dir() else Path("results")
 
 
 def named(word: str) -> tuple[str, str]:

@@ -101,6 +101,8 @@ def drawings(grid: str, curves: Table | None, episodes: Table | None) -> Iterato
             for metric in metrics:
                 if kind == "curves" and metric not in leads and not _is_curve(table, metric):
                     continue
+                if column and not _has_effect(table, metric, column):
+                    continue
                 shown = statistics_of(table.facts, metric)
                 for statistic in shown if metric in leads else shown[-1:]:
                     name = "_".join([*words, _slug(metric), statistic])
@@ -153,6 +155,11 @@ def _is_curve(table: Table, metric: str) -> bool:
     """Return whether any run reports a metric at two moments, not at its close alone."""
     rows = mask(table, table["metric"] == metric)
     return any(len(set(run["env_steps"].tolist())) > 1 for run in groups(rows, ["run"]).values())
+
+
+def _has_effect(table: Table, metric: str, column: str) -> bool:
+    """Return whether any run with a setting reports a metric, not only those without it."""
+    return bool(((table["metric"] == metric) & (table[column] != "")).any())
 
 
 def _drawing(
