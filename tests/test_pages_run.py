@@ -150,7 +150,7 @@ model = build_model(IDEAL, np.zeros(0))
 qpos = np.repeat(model.key("home").qpos[None], 3, axis=0)
 """
 """What the pages speak of before: actions, an observation, a trajectory."""
-RUN = (("README.md", 0), ("adapters.md", 0), ("shifts.md", 1), ("view.md", 0))
+RUN = (("adapters.md", 0), ("adapters.md", 1), ("shifts.md", 1), ("view.md", 0))
 """Page and block. The others show a form (a task, a sink), or need packages and results of
 one's own."""
 
