@@ -4,9 +4,9 @@ FROM python:3.12-slim-bookworm
 # cpu, cuda12 or cuda13: the build of jax (the NVIDIA container toolkit brings the driver)
 ARG ACCEL=cpu
 
-# make and git for the targets and for what a run remembers of its code; OSMesa draws films
+# make for the targets; OSMesa draws films, with and without a GPU
 RUN apt-get update \
-    && apt-get install -y --no-install-recommends git libosmesa6 make \
+    && apt-get install -y --no-install-recommends libosmesa6 make \
     && rm -rf /var/lib/apt/lists/*
 
 WORKDIR /twirl
