@@ -26,7 +26,7 @@ def test_long_waits_are_explained_and_the_line_is_left_clean(
         deadline = time.monotonic() + 30
         while not screen.getvalue() and time.monotonic() < deadline:
             time.sleep(0.01)
-    assert screen.getvalue() == "loading things ...\r\033[K"
+    assert screen.getvalue() == f"loading things ...\r{' ' * 18}\r"
 
 
 def test_short_waits_and_pipes_show_nothing(monkeypatch: pytest.MonkeyPatch) -> None:

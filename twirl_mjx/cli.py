@@ -79,7 +79,7 @@ def set_up(draws: bool) -> None:
 
 
 def _import_command(name: str) -> Any:
-    with waiting("loading jax and MuJoCo"):
+    with waiting("starting"):
         return importlib.import_module(f"twirl_mjx.commands.{name}")
 
 

@@ -121,6 +121,8 @@ def test_evaluation_time_is_not_in_the_rates(tmp_path: Path, clock: FakeTime) ->
         with logger.aside("evaluating ..."):
             clock.now += 50.0
         logger.log(100, 50, {})
+        clock.now += 2.0
+        logger.log(100, 50, {"eval/final_return": 1.0})  # steps nowhere, so it has no rate
     assert values_of(tmp_path, "env_steps_per_s") == pytest.approx([50.0])
     assert values_of(tmp_path, "compile_s") == []
 

@@ -36,4 +36,5 @@ def waiting(what: str, patience_s: float = PATIENCE_S) -> Iterator[None]:
         timer.cancel()
         timer.join()
         if shown.is_set():
-            print("\r\033[K", end="", file=sys.stderr, flush=True)
+            blank = " " * len(f"{what} ...")  # no escape code, which a dumb terminal would show
+            print(f"\r{blank}\r", end="", file=sys.stderr, flush=True)

@@ -182,14 +182,14 @@ class RunLogger:
                 self.announce(f"sink {type(sink).__name__} failed and is dropped: {why}")
 
     def _rates(self, env_steps: int, grad_steps: int) -> dict[str, float]:
-        """Return the rates since the last call, or the compilation time if there was one."""
+        """Return the rates since the last call, if any step was made, or the compilation time."""
         now, compile_s, aside_s = time.monotonic(), self._compile_s, self._aside_s
         last, self._last = self._last, (env_steps, grad_steps, now)
         self._compile_s = self._aside_s = 0.0
         if compile_s:
             return {"compile_s": compile_s}
         seconds = 0.0 if last is None else now - last[2] - aside_s
-        if last is None or seconds <= 0.0:
+        if last is None or seconds <= 0.0 or env_steps == last[0]:  # the last evaluation, say
             return {}
         return {
             "env_steps_per_s": (env_steps - last[0]) / seconds,
