@@ -13,6 +13,7 @@ order. A damaged checkpoint is stepped over.
 
 from __future__ import annotations
 
+import os
 import shutil
 from collections.abc import Iterator, Set
 from pathlib import Path
@@ -137,6 +138,8 @@ class Checkpoints:
         except Exception as error:
             at = "no checkpoint yet" if kept is None else f"the checkpoint at {kept:,} transitions"
             error.add_note(f"saved: {at}")
+            if isinstance(error, OSError) and error.filename is None:
+                error.filename = f"{self._root}{os.sep}"  # a write that failed names no file
             raise
         self._prune(state.replay.online.capacity)
 

@@ -99,7 +99,7 @@ class Batch:
         self._deadline = deadline
         rings = [part.source for part in parts if part.source is not None]
         own = any(ring is not rings[0] for ring in rings)
-        self.program = Program([part.config for part in parts], own_sources=own)
+        self.program = Program(tuple(part.config for part in parts), own_sources=own)
         env = self.program.env
         check_learner(config.droq, env.observation_size, env.action_size)
         self.runs = [Run(part, env, stage) for part in parts]
