@@ -17,12 +17,24 @@ RANGES = {
     "friction": (0.01, 4.0),
     "gravity": (0.01, 30.0),
     "payload": (-1.0, 10.0),
+    "mass_error": (0.0, 0.5),
+    "inertia_error": (0.0, 0.5),
+    "encoder_delay_ms": (0.0, 20.0),
+    "encoder_step": (0.0, 0.1),
     "incline_deg": (0.0, 20.0),
     "bump_height": (0.0, 0.1),
     "hurdle_gap": (0.3, 10.0),
     "hurdle_height": (0.001, 0.2),
 }
 """Lowest and highest values of a rehearsal's conditions, in the units of its fields."""
+
+CONTACTS = {
+    "plain": ((0.02, 1.0), (0.9, 0.95, 0.001)),
+    "soft": ((0.06, 1.0), (0.8, 0.9, 0.005)),
+    "hard": ((0.004, 1.0), (0.97, 0.995, 0.0005)),
+}
+"""Contact -> MuJoCo's ``solref`` (time constant in s, damping ratio) and ``solimp`` (least and
+largest impedance, m of depth between them) of ground and bands; ``plain`` is its default."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -31,6 +43,10 @@ class RehearsalConfig:
 
     sim_dt: float = 0.001
     """Physics step, s; the control step of 0.05 s must be a multiple of it."""
+    integrator: Literal["implicitfast", "implicit", "Euler", "RK4"] = "implicitfast"
+    """How MuJoCo advances the state; training uses the first."""
+    contact: Literal["plain", "soft", "hard"] = "plain"
+    """How the ground and the bands give way; ``plain`` as in training."""
     latency_ms: float = 15.0
     """Time from reading the sensors to the motors' new targets, ms."""
     orientation_noise: float = 0.01
@@ -39,6 +55,10 @@ class RehearsalConfig:
     """Standard deviation of the measured angular velocity, rad/s."""
     joint_noise: float = 0.005
     """Standard deviation of the measured joint angles, rad."""
+    encoder_delay_ms: float = 0.0
+    """Age of the joint angles and speeds that the motors' PD law and the policy get, ms."""
+    encoder_step: float = 0.0
+    """What their angles are rounded to a multiple of, rad; 0 rounds nothing."""
     position_noise: float = 0.005
     """Standard deviation of the estimated base position per reading, m."""
     velocity_noise: float = 0.05
@@ -69,6 +89,10 @@ class RehearsalConfig:
     """Downward acceleration, m/s^2."""
     payload: float = 0.0
     """Mass added at the trunk's centre of mass, kg."""
+    mass_error: float = 0.0
+    """Largest error of a body's mass; per episode and body times U(1 - error, 1 + error)."""
+    inertia_error: float = 0.0
+    """The same of its moments of inertia, beside the error that its mass makes in them."""
     incline_deg: float = 0.0
     """Angle of the hill that begins 0.5 m ahead, deg."""
     bump_height: float = 0.0
@@ -92,6 +116,11 @@ class RehearsalConfig:
             raise ValueError(
                 f"sim_dt {self.sim_dt} s does not divide the control step of 0.05 s (nearest:"
                 f" {nearest:.6g})"
+            )
+        if 2.0 * self.sim_dt > CONTACTS[self.contact][0][0]:
+            raise ValueError(
+                f"contact {self.contact} needs steps of at most {CONTACTS[self.contact][0][0] / 2}"
+                f" s, sim_dt is {self.sim_dt} s (nearest: contact plain)"
             )
         if not 0.0 <= self.full_torque_speed < self.no_load_speed:
             raise ValueError(
@@ -119,6 +148,11 @@ class RehearsalConfig:
     def latency_steps(self) -> int:
         """Latency in physics steps, rounded."""
         return round(0.001 * self.latency_ms / self.sim_dt)
+
+    @property
+    def encoder_steps(self) -> int:
+        """Age of what the encoders say in physics steps, rounded."""
+        return round(0.001 * self.encoder_delay_ms / self.sim_dt)
 
 
 IDEAL = RehearsalConfig(

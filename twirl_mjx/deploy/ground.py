@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 
 from twirl_mjx.assets import asset_path
-from twirl_mjx.deploy.conditions import RehearsalConfig
+from twirl_mjx.deploy.conditions import CONTACTS, RehearsalConfig
 
 TRUNK_MASS = 4.713
 """kg, without payload (assets/a1/README.md)."""
@@ -64,6 +64,7 @@ def build_model(config: RehearsalConfig, hurdles: np.ndarray) -> mujoco.MjModel:
         )
     spec = mujoco.MjSpec.from_file(str(asset_path("a1", "a1.xml")))
     spec.option.timestep = config.sim_dt
+    spec.option.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{config.integrator.upper()}")
     spec.option.iterations, spec.option.ls_iterations = 50, 50
     for geom in spec.geoms:
         if geom.name.endswith(("_collision", "_foot")):
@@ -87,8 +88,24 @@ def build_model(config: RehearsalConfig, hurdles: np.ndarray) -> mujoco.MjModel:
     model.actuator_gainprm[:], model.actuator_biasprm[:] = 0.0, 0.0
     model.actuator_gainprm[:, 0] = 1.0
     model.actuator_ctrllimited[:] = model.actuator_forcelimited[:] = 0
+    ground = model.geom_bodyid == 0
+    model.geom_solref[ground], model.geom_solimp[ground, :3] = CONTACTS[config.contact]
     set_conditions(model, config)
     return model
+
+
+def err_bodies(model: mujoco.MjModel, config: RehearsalConfig, rng: np.random.Generator) -> float:
+    """Give every body of the robot an error of mass and of inertia, as ``config`` says.
+
+    Returns:
+        The mass of the trunk in kg, without payload.
+    """
+    robot, count = slice(1, None), model.nbody - 1
+    mass = 1.0 + config.mass_error * rng.uniform(-1.0, 1.0, count)
+    shape = 1.0 + config.inertia_error * rng.uniform(-1.0, 1.0, count)
+    model.body_mass[robot] *= mass
+    model.body_inertia[robot] *= (mass * shape)[:, None]
+    return TRUNK_MASS * mass[model.body("trunk").id - 1]
 
 
 def _add_ground(spec: mujoco.MjSpec, config: RehearsalConfig) -> None:
@@ -129,10 +146,18 @@ def _add_sky(spec: mujoco.MjSpec) -> None:
     )
 
 
-def set_conditions(model: mujoco.MjModel, config: RehearsalConfig) -> None:
-    """Write gravity, friction and payload into a model; all of them may change while it runs."""
+def set_conditions(
+    model: mujoco.MjModel, config: RehearsalConfig, trunk_mass: float = TRUNK_MASS
+) -> None:
+    """Write gravity, friction and payload into a model; all of them may change while it runs.
+
+    Args:
+        model: changed in place.
+        config: conditions.
+        trunk_mass: kg, without payload.
+    """
     model.opt.gravity[:] = 0.0, 0.0, -config.gravity
     model.geom_friction[model.geom_bodyid == 0] = config.friction, 0.005, 0.0001
     trunk = model.body("trunk").id
-    model.body_mass[trunk] = TRUNK_MASS + config.payload
+    model.body_mass[trunk] = trunk_mass + config.payload
     mujoco.mj_setConst(model, mujoco.MjData(model))

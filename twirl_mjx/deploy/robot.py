@@ -6,6 +6,8 @@ simulation, only the robot's MJCF file.
 
 from __future__ import annotations
 
+from collections import deque
+
 import mujoco
 import numpy as np
 
@@ -30,7 +32,8 @@ def motor_shares(config: RehearsalConfig) -> np.ndarray:
 def motor_torque(
     config: RehearsalConfig,
     target: np.ndarray,
-    joint_pos: np.ndarray,
+    seen_pos: np.ndarray,
+    seen_vel: np.ndarray,
     joint_vel: np.ndarray,
     share: np.ndarray | float = 1.0,
 ) -> np.ndarray:
@@ -43,14 +46,15 @@ def motor_torque(
     Args:
         config: gains and limits.
         target: [12] rad.
-        joint_pos: [12] rad.
-        joint_vel: [12] rad/s.
+        seen_pos: [12] rad, what the encoders say.
+        seen_vel: [12] rad/s, the same.
+        joint_vel: [12] rad/s, at which the motors turn.
         share: [12] of gains and limits that a motor has.
     """
     span = config.no_load_speed - config.full_torque_speed
     up = config.torque_limit * np.clip((config.no_load_speed - joint_vel) / span, 0.0, 1.0)
     down = config.torque_limit * np.clip((config.no_load_speed + joint_vel) / span, 0.0, 1.0)
-    return share * np.clip(config.kp * (target - joint_pos) - config.kd * joint_vel, -down, up)
+    return share * np.clip(config.kp * (target - seen_pos) - config.kd * seen_vel, -down, up)
 
 
 class CommandFilter:
@@ -73,6 +77,29 @@ class CommandFilter:
         return np.clip(out, LOWER, UPPER)
 
 
+class Encoder:
+    """Joint angles and speeds as the robot knows them: late, and the angles in steps."""
+
+    def __init__(self, config: RehearsalConfig, data: mujoco.MjData) -> None:
+        """Start as if the robot had always stood as it does in ``data``."""
+        self._step, length = config.encoder_step, config.encoder_steps + 1
+        self._queue = deque([self._sample(data)] * length, maxlen=length)
+
+    def _sample(self, data: mujoco.MjData) -> tuple[np.ndarray, np.ndarray]:
+        angles = data.qpos[7:].copy()
+        if self._step:
+            angles = self._step * np.round(angles / self._step)
+        return angles, data.qvel[6:].copy()
+
+    def push(self, data: mujoco.MjData) -> None:
+        """Take the state after one physics step."""
+        self._queue.append(self._sample(data))
+
+    def read(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return angles [12] rad and speeds [12] rad/s."""
+        return self._queue[0]
+
+
 class Sensors:
     """Reads the simulated robot with noise and drift."""
 
@@ -81,9 +108,9 @@ class Sensors:
         self._more = rng.spawn(1)[0]  # what is drawn for foreign policies changes nothing else
         self._drift = np.zeros(3)
 
-    def read(self, data: mujoco.MjData) -> Reading:
+    def read(self, data: mujoco.MjData, encoder: Encoder) -> Reading:
         """Return the reading of one control step."""
-        c = self.config
+        c, (joint_pos, joint_vel) = self.config, encoder.read()
 
         def normal(size: int) -> np.ndarray:
             return c.noise * self._rng.standard_normal(size)
@@ -98,10 +125,10 @@ class Sensors:
         return Reading(
             rotation=quaternion_matrix(data.qpos[3:7]) @ tilt,
             angular_velocity=data.qvel[3:6] + c.rate_noise * normal(3),
-            joint_pos=data.qpos[7:19] + c.joint_noise * normal(12),
+            joint_pos=joint_pos + c.joint_noise * normal(12),
             position=data.qpos[:3] + self._drift + c.position_noise * normal(3),
             velocity=data.qvel[:3] + c.velocity_noise * more(3),
-            joint_vel=data.qvel[6:18] + c.joint_velocity_noise * more(12),
+            joint_vel=joint_vel + c.joint_velocity_noise * more(12),
         )
 
 

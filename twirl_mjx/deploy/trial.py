@@ -16,11 +16,18 @@ import mujoco
 import numpy as np
 
 from twirl_mjx.deploy.conditions import CONTROL_HZ, LIVE, RehearsalConfig
-from twirl_mjx.deploy.ground import build_model, ground_height, set_conditions
+from twirl_mjx.deploy.ground import build_model, err_bodies, ground_height, set_conditions
 from twirl_mjx.deploy.imitation import FollowScore
 from twirl_mjx.deploy.pilots import Pilot
 from twirl_mjx.deploy.reference import HURDLES, IMITATE, Reading, Score, succeeded
-from twirl_mjx.deploy.robot import CommandFilter, Contacts, Sensors, motor_shares, motor_torque
+from twirl_mjx.deploy.robot import (
+    CommandFilter,
+    Contacts,
+    Encoder,
+    Sensors,
+    motor_shares,
+    motor_torque,
+)
 
 BANDS = 24
 """Hurdle bands laid out: more than 20 s at 2 m/s can reach."""
@@ -73,6 +80,7 @@ def advance(
     targets: deque[tuple[int, np.ndarray]],
     contacts: Contacts,
     drive: Drive,
+    encoder: Encoder,
 ) -> str | None:
     """Advance the physics by one control step.
 
@@ -84,18 +92,20 @@ def advance(
             entries are removed, the one in force stays in front.
         contacts: contact rules.
         drive: totals, changed in place.
+        encoder: what the motors know of the joints; it takes every physics step.
 
     Returns:
         The cause if the episode ended.
     """
-    joint_pos, joint_vel = data.qpos[7:], data.qvel[6:]
+    joint_vel = data.qvel[6:]
     first, share = round(data.time / config.sim_dt), motor_shares(config)
     for now in range(first, first + config.n_substeps):
         while len(targets) > 1 and targets[1][0] <= now:
             targets.popleft()
-        torque = motor_torque(config, targets[0][1], joint_pos, joint_vel, share)
+        torque = motor_torque(config, targets[0][1], *encoder.read(), joint_vel, share)
         data.ctrl[:] = torque
         mujoco.mj_step(model, data)
+        encoder.push(data)
         np.maximum(drive.peak, np.abs(torque), out=drive.peak)
         drive.work += np.abs(torque * joint_vel) * config.sim_dt
         cause = contacts.cause(data)
@@ -135,17 +145,21 @@ class Trial:
         self.pilot, self.task, self.config = pilot, task, config
         self.hurdles = draw_hurdles(config, rng) if task == HURDLES else np.zeros(0)
         self._drawn = draw_goal(config, rng)
+        self._sensors = Sensors(config, rng)
         self.model = build_model(config, self.hurdles)
+        self._trunk_mass = err_bodies(self.model, config, rng.spawn(1)[0])
+        set_conditions(self.model, config, self._trunk_mass)
         self.data = mujoco.MjData(self.model)
         mujoco.mj_resetDataKeyframe(self.model, self.data, self.model.key("home").id)
         mujoco.mj_forward(self.model, self.data)
         self._feet = [self.model.geom(name).id for name in FEET]
         self._raise_to_ground()
-        self._sensors, self._contacts = Sensors(config, rng), Contacts(self.model, task)
+        self._contacts = Contacts(self.model, task)
+        self._encoder = Encoder(config, self.data)
         self.drive = Drive(np.zeros(self.model.nu), np.zeros(self.model.nu))
         self.score = self._new_score()
         self.score.start(self.data.qpos[:3], self.goal)
-        self._reading = self._sensors.read(self.data)
+        self._reading = self._sensors.read(self.data, self._encoder)
         pilot.reset(self._reading)
         self._command = CommandFilter(self._reading.joint_pos)  # a robot knows what it measures
         self._targets = deque([(0, self.data.qpos[7:].copy())])
@@ -196,7 +210,7 @@ class Trial:
             ):
                 raise ValueError(f"{field.name} needs a new episode")
         self.config = self._sensors.config = config
-        set_conditions(self.model, config)
+        set_conditions(self.model, config, self._trunk_mass)
 
     def decide(self) -> tuple[np.ndarray, np.ndarray]:
         """Ask the pilot: return the task's observation [O] and the action [12], unclipped."""
@@ -212,13 +226,19 @@ class Trial:
         start = self.steps * self.config.n_substeps + self.config.latency_steps
         self._targets.append((start, target))
         self.cause = advance(
-            self.model, self.data, self.config, self._targets, self._contacts, self.drive
+            self.model,
+            self.data,
+            self.config,
+            self._targets,
+            self._contacts,
+            self.drive,
+            self._encoder,
         )
         if self.cause != "diverged":
             self._judge(goal)
             self.cause = self.cause or self.score.cause()
             self._travelled = float(self.data.qpos[0])
-            self._reading = self._sensors.read(self.data)
+            self._reading = self._sensors.read(self.data, self._encoder)
             self.pilot.push(self._reading, action)
         self.steps += 1
         return Decision(reading, obs, action, target)
