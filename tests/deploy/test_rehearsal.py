@@ -194,6 +194,22 @@ def test_errors_of_mass_and_inertia_are_drawn_per_body() -> None:
     np.testing.assert_allclose(shape, shape[:, :1] * np.ones(3))  # one factor for a body's three
 
 
+def test_the_goal_walks_straight_on() -> None:
+    config = dataclasses.replace(SHORT, goal_speed=0.4)
+    walking, standing = (
+        rehearse(Constant(0.0), task="biped", episodes=1, config=c).episodes[0]
+        for c in (config, SHORT)
+    )
+    steps = np.diff(walking.goals, axis=0)
+    np.testing.assert_allclose(np.hypot(*steps.T), 0.02, atol=1e-9)
+    np.testing.assert_allclose(steps, np.tile(steps[0], (10, 1)), atol=1e-9)
+    np.testing.assert_array_equal(walking.goals[0], standing.goals[0])
+    assert np.ptp(standing.goals, axis=0).max() == 0.0
+    distances = np.linalg.norm(walking.goals - walking.qpos[:, :2], axis=1)[1:]
+    assert walking.metrics["mean_distance"] == pytest.approx(distances.mean())
+    assert walking.metrics["final_distance"] == pytest.approx(distances[-1])
+
+
 def test_an_error_changes_nothing_else_that_is_drawn() -> None:
     config = dataclasses.replace(SHORT, mass_error=0.2)
     runs = [rehearse("trot", task="biped", episodes=1, config=c).episodes[0]

@@ -139,15 +139,15 @@ def test_contact_friction_is_the_ground_s(scenes: dict[str, Scene], friction: fl
 
 
 def test_hurdles_are_drawn_on_the_ground_without_contact() -> None:
-    built = build_scene("sloped", bands=Bands((0.3, 2.5)))
+    built = build_scene("sloped", bands=Bands((0.3, 2.5), height=0.05))
     data = mujoco.MjData(built.mj_model)
     mujoco.mj_forward(built.mj_model, data)
     for i, x in enumerate((0.3, 2.5)):
         geom = built.mj_model.geom(f"hurdle_{i}")
         assert geom.contype[0] == geom.conaffinity[0] == 0
-        np.testing.assert_allclose(2 * geom.size[[0, 2]], [0.2, 0.01])
+        np.testing.assert_allclose(2 * geom.size[[0, 2]], [0.2, 0.05])
         z = np.tan(np.deg2rad(8)) * max(x - 0.5, 0.0)
-        np.testing.assert_allclose(data.geom_xpos[geom.id], [x, 0.0, z + 0.005], atol=1e-6)
+        np.testing.assert_allclose(data.geom_xpos[geom.id], [x, 0.0, z + 0.025], atol=1e-6)
         slope = data.geom_xmat[geom.id].reshape(3, 3)[2, 0]  # rise of the band's own x-axis
         assert slope == pytest.approx(np.sin(np.deg2rad(8)) if x > 0.5 else 0.0, abs=1e-6)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from types import SimpleNamespace
 from typing import Any
 
 import jax
@@ -11,10 +12,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from twirl_mjx.sim.dynamics import make_dynamics
 from twirl_mjx.sim.robots import A1
+from twirl_mjx.sim.scene import build_scene
+from twirl_mjx.tasks import base
 from twirl_mjx.tasks.base import Outcome
-from twirl_mjx.tasks.biped import Biped, BipedOptions
-from twirl_mjx.tasks.goals import GoalOptions, draw_goal
+from twirl_mjx.tasks.biped import Biped, BipedOptions, BipedState
+from twirl_mjx.tasks.goals import GoalOptions, draw_goal, walked
 from twirl_mjx.worlds.config import WorldConfig
 
 
@@ -161,3 +165,30 @@ def test_goal_stays_put_and_observation_points_to_it(
     np.testing.assert_allclose(
         last.obs[:, :2], np.asarray(first.world.goal - last.data.qpos[:, :2]), atol=1e-6
     )
+
+
+def test_a_walking_goal_by_hand() -> None:
+    task, key = Biped(BipedOptions(goal_speed=0.4)), jax.random.key(3)
+    view = base.make_view(
+        build_scene("flat"),
+        make_dynamics(),
+        jnp.asarray(raised(0.2)[None], jnp.float32),
+        jnp.zeros((1, 18)),
+    )
+    goal, places, seen = jnp.array([1.0, 0.0]), [], []
+    for _ in range(3):
+        world: Any = SimpleNamespace(key=key, goal=goal, task=BipedState(jnp.float32(0.8)))
+        outcome = task.judge(world, view, build_scene("flat"))
+        goal = outcome.goal
+        places.append(goal)
+        seen.append(float(outcome.metrics["goal_distance"]))
+    steps = np.diff([[1.0, 0.0], *np.array(places)], axis=0)
+    np.testing.assert_allclose(np.hypot(*steps.T), 0.4 * 0.05, atol=1e-6)
+    np.testing.assert_allclose(steps, np.tile(steps[0], (3, 1)), atol=1e-6)  # straight on
+    np.testing.assert_allclose(
+        seen, np.linalg.norm(np.array(places) - [0.2, 0.0], axis=1), atol=1e-6
+    )
+    other = walked(jax.random.key(4), jnp.zeros(2), 1.0)
+    assert not np.allclose(other, walked(key, jnp.zeros(2), 1.0), atol=1e-3)
+    with pytest.raises(ValueError, match=r"biped\.goal_speed = 3\.0 is outside .*nearest: 2\.0"):
+        BipedOptions(goal_speed=3.0)

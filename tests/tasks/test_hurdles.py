@@ -10,12 +10,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from twirl_mjx.evaluation.record import Recording, scene_model
 from twirl_mjx.sim.dynamics import make_dynamics
 from twirl_mjx.sim.robots import A1
 from twirl_mjx.sim.scene import build_scene, terrain_height
 from twirl_mjx.tasks import base, rewards
 from twirl_mjx.tasks.hurdles import WEIGHTS, Hurdles, HurdlesOptions, HurdlesState, advance, watch
 from twirl_mjx.tasks.observations import layout_size, layout_slices
+from twirl_mjx.worlds.config import WorldConfig
+from twirl_mjx.worlds.make import make_env
 
 FLAT = build_scene("flat")
 NOMINAL = make_dynamics()
@@ -70,7 +73,9 @@ def judge_with(task: Hurdles) -> Callable[..., base.Outcome]:
 
 
 JUDGE = judge_with(TASK)
-WATCH = jax.jit(lambda trace: watch(FLAT, NOMINAL, trace, jnp.array(POSITIONS)))
+WATCH = jax.jit(
+    lambda trace, height=0.01: watch(FLAT, NOMINAL, trace, jnp.array(POSITIONS), height)
+)
 
 
 def test_layout_covers_the_observation() -> None:
@@ -162,13 +167,35 @@ def test_a_touch_within_the_step_is_found() -> None:
     assert not JUDGE(task_state(), trace).terminated
 
 
-def test_how_near_a_foot_may_come() -> None:
+@pytest.mark.parametrize("height", [0.01, 0.05, 0.1])
+def test_how_near_a_foot_may_come(height: float) -> None:
     # Feet are 0.183 m before and behind the root, calves slant back and up from them.
     for gap, hit in ((-0.0005, True), (0.0005, False)):
-        above = standing(2.0 + 0.183, A1.home_height + 0.01 + gap)
+        above = standing(2.0 + 0.183, A1.home_height + height + gap)
         beside = standing(2.0 - 0.183 - 0.1 - 0.02 - gap, A1.home_height - 0.01)
         for pose in (above, beside):
-            assert bool(WATCH(jnp.asarray(np.tile(pose, (SUBSTEPS, 1)), jnp.float32)).hit) is hit
+            trace = jnp.asarray(np.tile(pose, (SUBSTEPS, 1)), jnp.float32)
+            assert bool(WATCH(trace, height).hit) is hit
+
+
+def test_the_option_height_decides_what_is_a_touch() -> None:
+    trace = flying(np.linspace(1.8, 2.2, SUBSTEPS), A1.home_height + 0.03)  # feet 3 cm up
+    assert not JUDGE(task_state(), trace).terminated
+    higher = judge_with(Hurdles(HurdlesOptions(height=0.05)))(task_state(), trace)
+    assert higher.terminated
+    assert higher.metrics["hit_hurdle"]
+    with pytest.raises(ValueError, match=r"hurdles\.height = 0\.5 is outside .*nearest: 0\.2"):
+        HurdlesOptions(height=0.5)
+
+
+def test_pictures_show_bands_as_high_as_they_are() -> None:
+    config = WorldConfig(task="hurdles", options=HurdlesOptions(height=0.05))
+    painted = make_env(config, num_envs=1).painter._model((2.0,)).geom("hurdle_0")
+    assert 2 * painted.size[2] == pytest.approx(0.05)
+    recording = Recording(
+        np.zeros((1, 19)), np.zeros((1, 3)), np.zeros(1), {}, (2.0,), np.ones(4), A1, 0.1
+    )
+    assert 2 * scene_model(config, recording).geom("hurdle_0").size[2] == pytest.approx(0.1)
 
 
 def test_hind_feet_still_hit_a_hurdle_that_was_passed() -> None:
@@ -249,7 +276,7 @@ def test_hurdles_stand_on_the_local_ground() -> None:
     pose = jnp.asarray(standing(2.0 - 0.183), jnp.float32)
     ground = terrain_height(scene, jnp.array([2.0, 0.0]), dynamics.incline, dynamics.bump_height)
     assert float(ground) == pytest.approx(1.5 * np.tan(np.radians(8.0)))
-    sloped = jax.jit(lambda trace: watch(scene, dynamics, trace, jnp.array(POSITIONS)))
+    sloped = jax.jit(lambda trace: watch(scene, dynamics, trace, jnp.array(POSITIONS), 0.01))
     for over, hit in ((0.0, True), (0.02, False)):
         trace = jnp.tile(pose.at[2].add(ground + over), (SUBSTEPS, 1))
         assert bool(sloped(trace).hit) is hit

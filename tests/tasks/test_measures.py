@@ -43,6 +43,9 @@ def test_biped_measures_by_hand() -> None:
     np.testing.assert_allclose(values["standing_time"], [0.1, 0.05])
     np.testing.assert_allclose(values["min_distance"], [0.1, 0.4])
     np.testing.assert_allclose(values["cosine"], [0.5, 0.5])
+    np.testing.assert_allclose(
+        values["mean_distance"], [0.5, 0.5]
+    )  # (0.9 + 0.1) / 2, (0.4 + 0.6) / 2
     np.testing.assert_allclose(values["terminated"], [0.0, 1.0])
     np.testing.assert_allclose(values["success"], [0.0, 0.0])
     after = measures.tracker_reset(BIPED, tracker, jnp.array([True, False]))

@@ -207,7 +207,14 @@ def film(path: Path, result: Rehearsal) -> tuple[Path, Path]:
     count = len(episode.qpos)
     bands = tuple(map(float, episode.hurdles[episode.hurdles < episode.qpos[:, 0].max() + 4.0]))
     recording = Recording(
-        episode.qpos, np.zeros((count, 3)), np.zeros(count), {}, bands, np.ones(4), A1
+        episode.qpos,
+        np.zeros((count, 3)),
+        np.zeros(count),
+        {},
+        bands,
+        np.ones(4),
+        A1,
+        result.config.hurdle_height,
     )
     model = scene_model(WorldConfig(task=result.task, options=kind.paper_options()), recording)
     captions = [[f"{result.task}, rehearsal  {A1.control_dt * i:5.2f} s"] for i in range(count)]

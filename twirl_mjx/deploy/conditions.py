@@ -23,6 +23,7 @@ RANGES = {
     "encoder_step": (0.0, 0.1),
     "incline_deg": (0.0, 20.0),
     "bump_height": (0.0, 0.1),
+    "goal_speed": (0.0, 2.0),
     "hurdle_gap": (0.3, 10.0),
     "hurdle_height": (0.001, 0.2),
 }
@@ -101,10 +102,12 @@ class RehearsalConfig:
     """Length of an episode, s."""
     goal_distance: float | None = 1.0
     """Distance of the biped's goal, m, in a random direction; ``None`` draws it as in training."""
+    goal_speed: float = 0.0
+    """Speed of the biped's goal, m/s, straight on in a direction drawn per episode."""
     hurdle_gap: float | None = None
     """Distance between hurdles, m; ``None`` draws every gap from U(1.6, 2.6) m."""
     hurdle_height: float = 0.01
-    """Height of a hurdle band, m."""
+    """Height of a hurdle band, m; the paper's are 1 cm."""
     height_of: Literal["root", "front_feet"] = "front_feet"
     """Height that ``stand`` rewards."""
 

@@ -128,6 +128,8 @@ class Score:
     """Hurdles passed so far; one that the robot moves back over stays passed."""
     min_distance: float = np.inf
     """Smallest planar distance to the goal so far, m."""
+    distance_sum: float = 0.0
+    """Of the distances to the goal at all steps so far, m."""
     previous_distance: float = np.inf
     """Distance to the goal one control step ago, m."""
 
@@ -180,6 +182,7 @@ class Score:
             reward *= 1.0 + (0.5 * facing + 0.5) ** 2 + progress
         self.previous_distance = distance
         self.min_distance = min(self.min_distance, distance)
+        self.distance_sum += distance
         self.reward_sum += float(reward)
         return float(reward)
 

@@ -27,6 +27,7 @@ UNITS = {
     "terminated": "1",
     "standing_time": "s",
     "min_distance": "m",
+    "mean_distance": "m",
     "final_distance": "m",
     "forward_speed": "m/s",
     "peak_torque": "N m",

@@ -146,8 +146,11 @@ class Trial:
         self.hurdles = draw_hurdles(config, rng) if task == HURDLES else np.zeros(0)
         self._drawn = draw_goal(config, rng)
         self._sensors = Sensors(config, rng)
+        later = rng.spawn(1)[0]  # what it draws changes nothing else
         self.model = build_model(config, self.hurdles)
-        self._trunk_mass = err_bodies(self.model, config, rng.spawn(1)[0])
+        self._trunk_mass = err_bodies(self.model, config, later)
+        angle = later.uniform(-np.pi, np.pi)
+        self._goal_step = config.goal_speed / CONTROL_HZ * np.array([np.cos(angle), np.sin(angle)])
         set_conditions(self.model, config, self._trunk_mass)
         self.data = mujoco.MjData(self.model)
         mujoco.mj_resetDataKeyframe(self.model, self.data, self.model.key("home").id)
@@ -235,7 +238,8 @@ class Trial:
             self._encoder,
         )
         if self.cause != "diverged":
-            self._judge(goal)
+            self._drawn = self._drawn + self._goal_step
+            self._judge(goal if self.task == HURDLES else self.goal)
             self.cause = self.cause or self.score.cause()
             self._travelled = float(self.data.qpos[0])
             self._reading = self._sensors.read(self.data, self._encoder)
@@ -263,13 +267,14 @@ class Trial:
             "terminated": float(self.cause is not None),
             "standing_time": score.standing_steps / CONTROL_HZ,
             "min_distance": score.min_distance,
+            "mean_distance": score.distance_sum / self.steps,
             "final_distance": score.previous_distance,
             "forward_speed": self._travelled / seconds,
             "peak_torque": float(self.drive.peak.max()),
             "mean_power": float(self.drive.work.sum()) / seconds,
         }
         if self.task == IMITATE:  # it has no goal and nobody stands up
-            for name in ("standing_time", "min_distance", "final_distance"):
+            for name in ("standing_time", "min_distance", "mean_distance", "final_distance"):
                 del metrics[name]
         if self.task == HURDLES:
             metrics["hit_hurdle"] = float(self.cause == "hurdle")

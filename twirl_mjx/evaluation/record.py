@@ -42,6 +42,8 @@ class Recording:
     """[4] in [0, 1] of the episode, order ``robot.legs``."""
     robot: Robot
     """Who moves."""
+    band_height: float = 0.0
+    """m, of the hurdle bands."""
 
 
 def record_episode(
@@ -90,7 +92,16 @@ def record_episode(
     stacked = jax.tree.map(lambda *x: np.stack(x), *metrics)
     reached = hurdles[hurdles < qpos[:, 0].max() + BANDS_AHEAD]
     hurdles_reached = tuple(map(float, reached))
-    return Recording(qpos, goals, reward, stacked, hurdles_reached, strength, env.scene.robot)
+    return Recording(
+        qpos,
+        goals,
+        reward,
+        stacked,
+        hurdles_reached,
+        strength,
+        env.scene.robot,
+        env.task.band_height,
+    )
 
 
 def scene_model(config: WorldConfig, recording: Recording) -> mujoco.MjModel:
@@ -99,6 +110,7 @@ def scene_model(config: WorldConfig, recording: Recording) -> mujoco.MjModel:
     bands = Bands(
         recording.hurdles,
         y=float(recording.qpos[0, 1]),
+        height=recording.band_height,
         incline=float(dynamics.incline),
         bump_height=float(dynamics.bump_height),
     )

@@ -43,8 +43,6 @@ BUMP_SEED = 7
 
 HURDLE_LENGTH = 0.2
 """m, extent of a hurdle band along x (paper, section "Jumping Task")."""
-HURDLE_HEIGHT = 0.01
-"""m, height of a hurdle band."""
 DRAWN_HALF_WIDTH = 1.5
 """m, half the drawn extent in y of a band, which is endless for the task."""
 BUMPY_PIECES = (2, 20)
@@ -96,6 +94,8 @@ class Bands:
     """m, world x of the centres."""
     y: float = 0.0
     """m, world y of the middle of the drawn part."""
+    height: float = 0.01
+    """m, of the paper's bands (section "Jumping Task"), flat on the ground."""
     incline: float = HILL_ANGLE
     """rad, of the hill of a ``sloped`` scene."""
     bump_height: float = 0.05
@@ -188,8 +188,8 @@ def _add_bands(spec: mujoco.MjSpec, kind: SceneKind, bands: Bands, height_of: He
             spec.worldbody.add_geom(
                 name=name,
                 type=mujoco.mjtGeom.mjGEOM_BOX,
-                size=[*half, HURDLE_HEIGHT / 2],
-                pos=[*centre, height[0] + HURDLE_HEIGHT / 2],
+                size=[*half, bands.height / 2],
+                pos=[*centre, height[0] + bands.height / 2],
                 quat=_tilt(slope_x, slope_y),
                 contype=0,
                 conaffinity=0,

@@ -15,7 +15,7 @@ import numpy as np
 
 from twirl_mjx.sim.kinematics import reach_limits
 from twirl_mjx.sim.robot import Robot
-from twirl_mjx.sim.scene import HURDLE_HEIGHT, HURDLE_LENGTH
+from twirl_mjx.sim.scene import HURDLE_LENGTH
 
 
 def reach(robot: Robot) -> float:
@@ -43,12 +43,13 @@ def nearest(positions: jax.Array, x: jax.Array) -> jax.Array:
     return positions[jnp.argmin(jnp.abs(x[..., None] - positions), axis=-1)]
 
 
-def rectangle_distance(start: jax.Array, end: jax.Array) -> jax.Array:
+def rectangle_distance(start: jax.Array, end: jax.Array, height: float) -> jax.Array:
     """Return the exact distance from segments to a band's cross-section.
 
     Args:
         start: [..., 2] m, x from the band's centre and height over the ground.
         end: [..., 2] m, the other end; equal to ``start`` for a sphere.
+        height: m, of the band.
 
     Returns:
         [...] m, 0 where they meet.
@@ -60,31 +61,37 @@ def rectangle_distance(start: jax.Array, end: jax.Array) -> jax.Array:
 
     def point_sq(x: jax.Array, h: jax.Array) -> jax.Array:
         gap_x = jnp.maximum(jnp.abs(x) - half, 0.0)
-        gap_h = jnp.maximum(jnp.maximum(h - HURDLE_HEIGHT, -h), 0.0)
+        gap_h = jnp.maximum(jnp.maximum(h - height, -h), 0.0)
         return gap_x * gap_x + gap_h * gap_h
 
     # The squared distance along the segment is convex and smooth: its least value lies at an end,
     # at the point nearest to a corner, or is 0.
     least = jnp.minimum(point_sq(x0, h0), point_sq(x1, h1))
     for corner_x in (-half, half):
-        for corner_h in (0.0, HURDLE_HEIGHT):
+        for corner_h in (0.0, height):
             t = ((corner_x - x0) * dx + (corner_h - h0) * dh) / length_sq
             t = jnp.clip(t, 0.0, 1.0)
             least = jnp.minimum(least, point_sq(x0 + t * dx, h0 + t * dh))
     # Convex shapes are apart exactly if an axis separates them: x, height, or the segment's normal.
-    middle = HURDLE_HEIGHT / 2
+    middle = height / 2
     side = jnp.abs(dx * (middle - h0) + dh * x0)
     apart = (
         (jnp.minimum(x0, x1) > half)
         | (jnp.maximum(x0, x1) < -half)
-        | (jnp.minimum(h0, h1) > HURDLE_HEIGHT)
+        | (jnp.minimum(h0, h1) > height)
         | (jnp.maximum(h0, h1) < 0.0)
         | (side > half * jnp.abs(dh) + middle * jnp.abs(dx))
     )
     return jnp.where(apart, jnp.sqrt(least), 0.0)
 
 
-def shape_distance(x: jax.Array, height: jax.Array, radii: jax.Array, band: jax.Array) -> jax.Array:
+def shape_distance(
+    x: jax.Array,
+    height: jax.Array,
+    radii: jax.Array,
+    band: jax.Array,
+    band_height: float,
+) -> jax.Array:
     """Return the distance from capsules to a band.
 
     Args:
@@ -92,12 +99,13 @@ def shape_distance(x: jax.Array, height: jax.Array, radii: jax.Array, band: jax.
         height: [..., G, 2] m, of the axis ends over the local ground.
         radii: [G] m.
         band: [...] m, world x of the band's centre.
+        band_height: m.
 
     Returns:
         [..., G] m, at most 0 where they touch; below 0 it is not the depth of penetration.
     """
     ends = jnp.stack([x - band[..., None, None], height], axis=-1)
-    return rectangle_distance(ends[..., 0, :], ends[..., 1, :]) - radii
+    return rectangle_distance(ends[..., 0, :], ends[..., 1, :], band_height) - radii
 
 
 def stepped_in(positions: jax.Array, feet_x: jax.Array, contact: jax.Array) -> jax.Array:

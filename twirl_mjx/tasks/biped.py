@@ -16,7 +16,7 @@ from etils import epy
 
 from twirl_mjx.checks import check_choice, check_range
 from twirl_mjx.sim.robot import HIP, THIGH, TRUNK
-from twirl_mjx.tasks.goals import GOAL_OPTIONS, GoalOptions, draw_goal
+from twirl_mjx.tasks.goals import GOAL_OPTIONS, GoalOptions, draw_goal, walked
 from twirl_mjx.tasks.stand import STANDING_MEASURES, STANDING_SUCCESS_S
 from twirl_mjx.tasks.task import POLISH, Link, Measure, Task
 
@@ -58,6 +58,8 @@ the goal earns little in the paper's reward as long as it costs balance."""
 class BipedOptions(GoalOptions):
     """Task ``biped``: walk to a goal on the hind legs."""
 
+    goal_speed: float = 0.0
+    """m/s, of a goal that walks straight on, in a direction drawn per episode."""
     distance_reward: Literal["nearer", "speed"] = "nearer"
     """Pay 0.5 for being nearer than a step before (the paper's), or by the speed of approach."""
     distance_weight: float = 1.0
@@ -68,6 +70,7 @@ class BipedOptions(GoalOptions):
     def __post_init__(self) -> None:
         """Check every option, or raise ValueError."""
         super().__post_init__()
+        check_range("biped.goal_speed", self.goal_speed, 0.0, 2.0)
         check_choice("biped.distance_reward", self.distance_reward, ("nearer", "speed"))
         check_range("biped.distance_weight", self.distance_weight, 0.0, 100.0)
 
@@ -84,6 +87,9 @@ class Biped(Task[BipedOptions]):
         "min_distance": Measure(
             "goal_distance", "min", 1.0, "m", "closest approach to the goal", smaller_is_better=True
         ),
+        "mean_distance": Measure(
+            "goal_distance", "mean", 1.0, "m", "mean distance to the goal", smaller_is_better=True
+        ),
         "cosine": STANDING_MEASURES["cosine"],
     }
     lead = ("return", "standing_time", "on_feet", "success")
@@ -93,7 +99,7 @@ class Biped(Task[BipedOptions]):
         Link("biped", {"task": "biped"} | POLISH),
     )
     presets = {"cpu": {"total_env_steps": 800_000}}
-    course_options = GOAL_OPTIONS
+    course_options = (*GOAL_OPTIONS, "goal_speed")
     caption = ("cosine", "goal_distance")
     shows_goal = True
 
@@ -122,7 +128,10 @@ class Biped(Task[BipedOptions]):
     def judge(self, world: base.World, view: base.View, scene: Scene) -> base.Outcome:
         """Score one control step."""
         x_axis, _, z_axis = frames.base_axes(view.qpos[3:7])
-        displacement = world.goal - view.qpos[:2]
+        goal, speed = world.goal, self.options.goal_speed
+        if speed:
+            goal = walked(world.key, goal, speed * self.robot.control_dt)
+        displacement = goal - view.qpos[:2]
         distance = jnp.linalg.norm(displacement)
         upright, bonus = rewards.normalised_cosine(x_axis[2]), rewards.height_bonus(view.height)
         facing = rewards.normalised_cosine(rewards.facing_cosine(z_axis, displacement))
@@ -132,7 +141,7 @@ class Biped(Task[BipedOptions]):
         return base.Outcome(
             reward=(upright + bonus) * (1.0 + facing + weight * progress),
             terminated=fall,
-            goal=world.goal,
+            goal=goal,
             task=BipedState(previous_distance=distance),
             metrics={
                 "stand": upright + bonus,

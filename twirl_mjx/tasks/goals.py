@@ -13,6 +13,9 @@ with epy.lazy_imports():  # needed by worlds, not by options
     import jax
     import jax.numpy as jnp
 
+HEADING = 1004
+"""What is folded into a world's key for the heading of its goal, beside ``worlds.vector``'s."""
+
 
 @dataclasses.dataclass(frozen=True)
 class GoalOptions:
@@ -65,3 +68,12 @@ def draw_goal(
     radius = jnp.clip(options.goal_mean_radius * jax.random.exponential(radius_key), low, high)
     angle = jax.random.uniform(angle_key, minval=-jnp.pi, maxval=jnp.pi)
     return start + radius * jnp.stack([jnp.cos(angle), jnp.sin(angle)])
+
+
+def walked(key: jax.Array, goal: jax.Array, step: float) -> jax.Array:
+    """Return a goal [2] in m after one step of ``step`` m.
+
+    heading = U(-pi, pi), the same for every step of an episode, from the key of its world.
+    """
+    heading = jax.random.uniform(jax.random.fold_in(key, HEADING), minval=-jnp.pi, maxval=jnp.pi)
+    return goal + step * jnp.stack([jnp.cos(heading), jnp.sin(heading)])

@@ -35,6 +35,8 @@ if TYPE_CHECKING:
 WEIGHTS = {"forward": 0.7, "orientation": 0.05, "joint_calm": 0.15, "hurdle": 0.1}
 """Weights of the reward terms (paper appendix, table of the jumping task)."""
 
+HEIGHTS = (0.001, 0.2)
+"""m, least and largest height of a band."""
 PASSED = 0.4
 """m, a hurdle counts as passed when the root is this far beyond its centre (paper)."""
 MAX_SPEED = 4.0
@@ -73,7 +75,11 @@ class Crossing(NamedTuple):
 
 
 def watch(
-    scene: Scene, dynamics: Dynamics, qpos_trace: jax.Array, positions: jax.Array
+    scene: Scene,
+    dynamics: Dynamics,
+    qpos_trace: jax.Array,
+    positions: jax.Array,
+    band_height: float,
 ) -> Crossing:
     """Test every physics substep ``qpos_trace`` [S, 7 + J] against hurdles at ``positions`` [H]."""
     robot = scene.robot
@@ -84,7 +90,7 @@ def watch(
     band = bands.nearest(positions, qpos_trace[:, 0])
     feet = np.flatnonzero(robot.contact_mask(FOOT))
     return Crossing(
-        hit=jnp.any(bands.shape_distance(x, height, radii, band) <= 0.0),
+        hit=jnp.any(bands.shape_distance(x, height, radii, band, band_height) <= 0.0),
         stepped_in=bands.stepped_in(
             positions, x[:, feet, 0], height[:, feet, 0] < robot.foot_radius + FOOT_CONTACT
         ),
@@ -135,6 +141,8 @@ class HurdlesOptions:
     """m, distance when the course is fixed (dynamics shifts)."""
     gap: float | None = None
     """m, distance of all hurdles, on a fixed and on a random course, instead of the above."""
+    height: float = 0.01
+    """m, height of the bands; the paper's are 1 cm, harder courses have 5 or 10 cm."""
     hurdle_bonus: Literal["count", "event", "clean"] = "count"
     """Pay the number of hurdles passed so far at every step, or 1 when one is passed, or the
     number passed in a single flight so far at every step."""
@@ -144,6 +152,7 @@ class HurdlesOptions:
         check_choice("hurdles.hurdle_bonus", self.hurdle_bonus, ("count", "event", "clean"))
         for name in ("min_gap", "max_gap", "fixed_gap"):
             check_range(f"hurdles.{name}", getattr(self, name), 0.0, 1000.0)
+        check_range("hurdles.height", self.height, *HEIGHTS)
         if self.gap is not None:
             check_range("hurdles.gap", self.gap, 0.0, 1000.0)
 
@@ -198,6 +207,7 @@ class Hurdles(Task[HurdlesOptions]):
                 f" (nearest: {max(low, least)} to {max(low, high, least)})"
             )
         self._gaps = (low, high)
+        self.band_height = self.options.height
         seconds = self.episode_length * self.robot.control_dt
         self.num_hurdles = math.ceil(seconds * MAX_SPEED / low) + 1
         """H, never all passed in an episode."""
@@ -228,7 +238,9 @@ class Hurdles(Task[HurdlesOptions]):
 
     def judge(self, world: base.World, view: base.View, scene: Scene) -> base.Outcome:
         """Score one control step."""
-        crossing = watch(scene, world.dynamics, view.qpos_trace, world.task.positions)
+        crossing = watch(
+            scene, world.dynamics, view.qpos_trace, world.task.positions, self.band_height
+        )
         state = advance(world.task, crossing, view.qpos[0])
         terms = {
             "forward": rewards.forward(view.qvel[0]),

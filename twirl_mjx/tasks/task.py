@@ -97,6 +97,8 @@ class Task[O]:
     """Metrics written into films."""
     shows_goal: ClassVar[bool] = False
     """Whether films show the goal."""
+    band_height: float = 0.0
+    """m, of the bands that films show, see ``bands``."""
     observer: Observer
     """What the policy sees."""
 

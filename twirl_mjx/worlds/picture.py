@@ -21,9 +21,16 @@ BANDS_AHEAD = 4.0
 class Painter:
     """Draws worlds of one scene; keeps the OpenGL context and the scene of the last bands."""
 
-    def __init__(self, scene: Scene, dynamics: Dynamics) -> None:
-        """Keep the scene and the parameters (scalars) whose ground and colours are drawn."""
+    def __init__(self, scene: Scene, dynamics: Dynamics, band_height: float = 0.0) -> None:
+        """Keep the scene and the parameters (scalars) whose ground and colours are drawn.
+
+        Args:
+            scene: Robot and ground.
+            dynamics: Scalars.
+            band_height: m, of hurdle bands.
+        """
         self._scene = scene
+        self._band_height = band_height
         self._dynamics = dynamics
         self._view = CameraView()
         self._opened: tuple[tuple[float, ...], SceneRenderer] | None = None
@@ -61,7 +68,10 @@ class Painter:
         scene, dynamics = self._scene, self._dynamics
         if bands:
             drawn = Bands(
-                bands, incline=float(dynamics.incline), bump_height=float(dynamics.bump_height)
+                bands,
+                height=self._band_height,
+                incline=float(dynamics.incline),
+                bump_height=float(dynamics.bump_height),
             )
             scene = build_scene(scene.kind, robot=scene.robot, bands=drawn)
         model = world_model(scene, dynamics)

@@ -228,7 +228,8 @@ class VectorEnv:
         """Draws these worlds, under the default physical parameters of world 0."""
         from twirl_mjx.worlds.picture import Painter
 
-        return Painter(self.scene, jax.tree.map(lambda leaf: leaf[0], self.dynamics))
+        dynamics = jax.tree.map(lambda leaf: leaf[0], self.dynamics)
+        return Painter(self.scene, dynamics, self.task.band_height)
 
     def render(self, state: EnvState, world: int = 0) -> np.ndarray:
         """Return an image [480, 640, 3] uint8 of one world.
