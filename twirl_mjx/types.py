@@ -121,3 +121,5 @@ class Learner:
     """(state, config, transitions [U, B, ...], key) -> (state, float32 scalars by name)."""
     metrics: Mapping[str, MetricInfo]
     """Meaning of every scalar that ``update`` reports."""
+    value: Callable[[Any, Any, jax.Array, jax.Array], jax.Array] | None = None
+    """(state, config, obs [B, O], actions [B, A]) -> their values [B]; asked by a guide only."""

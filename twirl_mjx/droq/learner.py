@@ -9,12 +9,13 @@ All functions are pure and may be vmapped over a leading seed axis of state, min
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 
 import jax
 import jax.numpy as jnp
 
-from twirl_mjx.droq import forms, losses, networks
+from twirl_mjx.droq import forms, losses, networks, plain
 from twirl_mjx.droq.config import DroqConfig
 from twirl_mjx.droq.networks import Params
 from twirl_mjx.droq.state import CriticState, DroqState, adam_init, adam_step
@@ -54,6 +55,13 @@ def sample_action(actor: Params, obs: jax.Array, key: jax.Array) -> jax.Array:
 def mean_action(actor: Params, obs: jax.Array) -> jax.Array:
     """Return the deterministic actions tanh(mean), [..., A], at observations [..., O]."""
     return jnp.tanh(networks.actor_distribution(actor, obs)[0])
+
+
+def value(state: DroqState, config: DroqConfig, obs: jax.Array, action: jax.Array) -> jax.Array:
+    """Return the least of the target critics' values [B] of actions [B, A], without dropout."""
+    config = dataclasses.replace(config, dropout_rate=0.0)
+    q = plain.critic_q(state.target_critic, obs, action, config, jax.random.key(0))
+    return jnp.min(q, axis=0)
 
 
 def target_entropy(config: DroqConfig, action_size: int) -> float:
@@ -157,4 +165,4 @@ METRICS = {
 }
 """What ``update`` reports: means over critic updates, or values of the one actor update."""
 
-LEARNER = Learner("droq", DroqConfig, init, sample_action, mean_action, update, METRICS)
+LEARNER = Learner("droq", DroqConfig, init, sample_action, mean_action, update, METRICS, value)

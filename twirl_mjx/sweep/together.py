@@ -24,8 +24,8 @@ def alone(jobs: Sequence[Job], room: int) -> list[list[Job]]:
 
 def program_of(cell: Cell) -> str:
     """Return a text that the cells of one program have in common, and no other cell."""
-    if cell.config.variant == "zero-shot":  # nothing is compiled for long
-        return cell.name
+    if cell.config.variant == "zero-shot" or cell.config.guide != "none":
+        return cell.name  # nothing is compiled for long; guides of one program must be one
     return f"{cell.preset} {rundir.digest(of_program(cell.config))}"
 
 

@@ -6,7 +6,7 @@ Defaults are the paper's numbers; see ``presets.make_config`` and ``config_json`
 from __future__ import annotations
 
 import dataclasses
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 from twirl_mjx.checks import check_choice, check_range
 from twirl_mjx.droq.config import DroqConfig
@@ -16,6 +16,7 @@ from twirl_mjx.training.learners import DROQ, LEARNERS, settings_of
 from twirl_mjx.worlds.config import WorldConfig, world_fields
 
 Variant = Literal["scratch", "twirl", "twirl+weights", "weights", "zero-shot"]
+Guidance = Literal["none", "jump-start", "best-of"]
 VARIANTS: tuple[Variant, ...] = ("scratch", "twirl", "twirl+weights", "weights", "zero-shot")
 INT32_MAX = 2**31 - 1
 """Transitions and critic updates are counted on the device, in int32."""
@@ -58,6 +59,9 @@ class TrainConfig(WorldConfig):
     source: str = "auto"
     """auto (shipped policy, else train it), train, trot, bound, zero, random, clip, a run, a policy
     file (.npz, .onnx), recorded data (.npz) or file.py:function of your own."""
+    guide: Guidance = "none"
+    """Let the source act too: in the first steps of an episode, ever fewer (jump-start), or where
+    the critic values its action higher (best-of)."""
     source_contract: str = ""
     """How a foreign source meets the robot: go1_joystick, legged_gym_48, legged_gym_45, ... or a
     JSON file (docs/sources.md); by default what the file itself says."""
@@ -115,6 +119,12 @@ class TrainConfig(WorldConfig):
         if self.source_options is None and self.task_type.source:
             self._set("source_options", TASKS.get(self.task_type.source).Options())
         check_choice("variant", self.variant, VARIANTS)
+        check_choice("guide", self.guide, get_args(Guidance))
+        if self.guide != "none" and self.variant not in ("twirl", "twirl+weights"):
+            raise ValueError(
+                f"guide {self.guide} comes on top of mixed replay, which variant {self.variant} has"
+                " not (nearest: variant twirl)"
+            )
         check_range("seed", self.seed, 0, 2**32 - 1)  # 2**32 would be seed 0 again
         check_range("warmup_env_steps", self.warmup_env_steps, 0, INT32_MAX)
         countable = int(INT32_MAX // max(1.0, self.droq.utd))

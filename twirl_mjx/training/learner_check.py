@@ -40,6 +40,12 @@ def check_learner(config: LearnerConfig, observation_size: int, action_size: int
         _expect(jax.eval_shape(learner.sample, state.actor, obs, key), minibatches.action)
         at = "mean"
         _expect(jax.eval_shape(learner.mean, state.actor, obs), minibatches.action)
+        if (value := learner.value) is not None:
+            at = "value"
+            found = jax.eval_shape(
+                lambda s, o, a: value(s, config, o, a), state, obs[0], minibatches.action[0]
+            )
+            _expect(found, jax.ShapeDtypeStruct(minibatches.reward.shape[1:], jnp.float32))
         at = "update"
         after, metrics = jax.eval_shape(
             lambda s, m, k: learner.update(s, config, m, k), state, minibatches, key

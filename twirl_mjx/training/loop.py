@@ -22,6 +22,7 @@ from twirl_mjx.training import program
 from twirl_mjx.training.checkpoint import stored_steps
 from twirl_mjx.training.config import of_program
 from twirl_mjx.training.guards import DivergedError, check_experience, check_finite
+from twirl_mjx.training.guidance import Guide
 from twirl_mjx.training.learner_check import check_learner
 from twirl_mjx.training.logger import RunLogger
 from twirl_mjx.training.metrics import FIRST_DROP
@@ -99,7 +100,9 @@ class Batch:
         self._deadline = deadline
         rings = [part.source for part in parts if part.source is not None]
         own = any(ring is not rings[0] for ring in rings)
-        self.program = Program(tuple(part.config for part in parts), own_sources=own)
+        self.program = Program(
+            tuple(part.config for part in parts), own_sources=own, guide=guide_of(parts)
+        )
         env = self.program.env
         check_learner(config.droq, env.observation_size, env.action_size)
         self.runs = [Run(part, env, stage) for part in parts]
@@ -282,6 +285,23 @@ class Batch:
     def is_late(self) -> bool:
         """Return whether the time that was given is over."""
         return time.monotonic() >= self._deadline
+
+
+def guide_of(parts: Sequence[Part]) -> Guide | None:
+    """Return who acts beside the learners of all seeds, None if nobody does.
+
+    Raises:
+        ValueError: It would have to be another one for every seed, or there is none.
+    """
+    config, policy = parts[0].config, parts[0].policy
+    if config.guide == "none":
+        return None
+    if policy is None or any(part.policy is not policy for part in parts):
+        raise ValueError(
+            f"guide {config.guide} needs a source, one for all seeds of a program (nearest: one"
+            " seed at a time)"
+        )
+    return Guide(config, policy)
 
 
 def grad_steps(states: TrainState) -> int:

@@ -142,6 +142,8 @@ def run_together(
     """
     for config in configs[1:]:
         check_one_program(configs[0], config)
+    if source is None:
+        source_rules.check_one_guide(configs, preset)
     found = [
         RunDir(runs_dir / rundir.check_name(name or rundir.default_name(config, preset)))
         for config, name in zip(configs, names, strict=True)
@@ -257,6 +259,7 @@ def check_early(
         raise ValueError("variant scratch uses no source (nearest: variant 'twirl')")
     source_rules.check_source_is_used(config, preset)
     files.check_target(run_dir.config)
+    source_rules.check_guide(config, source)
     if config.variant not in ("scratch", "twirl") and source is None:
         check_acts(config.source)  # networks, or a policy to evaluate, are asked for
     config.make_task()  # refuses options that only the task can judge
@@ -312,7 +315,8 @@ def _train(members: list[Member], say: Say, deadline: float) -> None:
                 if place not in rings:
                     rings[place] = source_data(config, run_dir, source, say, collectors)
                 data = rings[place]
-        parts.append(Part(config, run_dir, data, initial, member.sinks))
+        policy = source.policy if source is not None and config.guide != "none" else None
+        parts.append(Part(config, run_dir, data, initial, member.sinks, policy))
     outcomes = loop.train(parts, stage=config.task, deadline=deadline)
     if not all(outcome.finished for outcome in outcomes):
         names = ", ".join(part.run_dir.name for part in parts)

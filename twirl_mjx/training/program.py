@@ -22,6 +22,7 @@ from twirl_mjx.training import seeds as batch
 from twirl_mjx.training import sharding
 from twirl_mjx.training import state as single
 from twirl_mjx.training.config import TrainConfig
+from twirl_mjx.training.guidance import Guide
 from twirl_mjx.training.learners import learner_of
 from twirl_mjx.training.state import TrainState
 from twirl_mjx.types import Learner
@@ -87,15 +88,23 @@ def compile_evaluation(
 class Program:
     """Everything that is compiled to train S seeds of one config."""
 
-    def __init__(self, configs: Sequence[TrainConfig], *, own_sources: bool = False) -> None:
+    def __init__(
+        self,
+        configs: Sequence[TrainConfig],
+        *,
+        own_sources: bool = False,
+        guide: Guide | None = None,
+    ) -> None:
         """Build (not compile) the functions.
 
         Args:
             configs: S runs that are alike (``config.of_program``).
             own_sources: Whether every seed has a source ring of its own.
+            guide: Who acts beside the learner, one for all seeds, or None.
         """
         config = configs[0]
         self.num_seeds = len(configs)
+        self._guide = guide
         self.env = make_env(config)
         self.evaluate = compile_evaluation(config, self.num_seeds)
         self._configs = configs
@@ -109,7 +118,10 @@ class Program:
         """Return the epoch and what puts a state where it runs: seeds or worlds on all devices."""
         config, env, own = self._configs[0], self.env, self._own_sources
         alone = self.num_seeds == 1
-        if (devices := jax.device_count()) > 1:
+        devices, guide = jax.device_count(), self._guide
+        if devices > 1 and guide is not None:
+            self.idle_devices = f"one device is used: guide {config.guide} works on one"
+        elif devices > 1:
             what = ("num_envs", env.num_envs) if alone else ("seeds", self.num_seeds)
             try:
                 sharding.check_even(*what, devices)
@@ -121,17 +133,19 @@ class Program:
                     return sharding.spread_worlds(config, env, mesh)
                 return sharding.spread_seeds(config, env, mesh, own_sources=own)
         if alone:
-            return single.compile_epoch(config, env), lambda state: state
-        return batch.compile_epoch_seeds(config, env, own_sources=own), lambda states: states
+            return single.compile_epoch(config, env, guide), lambda state: state
+        epoch = batch.compile_epoch_seeds(config, env, own_sources=own, guide=guide)
+        return epoch, lambda states: states
 
     def init(self) -> TrainState:
         """Return the states of all seeds before the first transition, without source rings."""
         config, env = self._configs[0], self.env
         if self.num_seeds == 1:
-            return jax.jit(lambda key: single.init(config, env, key, None))(
+            return jax.jit(lambda key: single.init(config, env, key, None, self._guide))(
                 jax.random.key(config.seed)
             )
-        states = batch.init_seeds(config, env, [each.seed for each in self._configs], None)
+        seeds = [each.seed for each in self._configs]
+        states = batch.init_seeds(config, env, seeds, None, self._guide)
         return states.replace(share=join([self._share(each) for each in self._configs]))
 
     def _share(self, config: TrainConfig) -> Share | None:
@@ -143,7 +157,9 @@ class Program:
     def template(self, index: int) -> TrainState:
         """Return shapes and dtypes of the state of one seed, as it is alone."""
         config, env = self._configs[index], self.env
-        return jax.eval_shape(lambda key: single.init(config, env, key, None), jax.random.key(0))
+        return jax.eval_shape(
+            lambda key: single.init(config, env, key, None, self._guide), jax.random.key(0)
+        )
 
     def stack(self, states: Sequence[TrainState]) -> TrainState:
         """Return the states of S seeds, each as it is alone, as one.

@@ -24,7 +24,7 @@ from twirl_mjx.training.learners import learner_of
 from twirl_mjx.training.rundir import RunDir
 from twirl_mjx.training.sinks.base import RunInfo, Sink
 from twirl_mjx.training.state import TrainState
-from twirl_mjx.types import MetricInfo
+from twirl_mjx.types import MetricInfo, SourcePolicy
 from twirl_mjx.worlds.vector import VectorEnv
 
 
@@ -42,6 +42,8 @@ class Part:
     """Changes the fresh learner before the first transition."""
     sinks: tuple[Sink, ...] = ()
     """Where metrics go beside ``metrics.csv``, TensorBoard and the terminal."""
+    policy: SourcePolicy | None = None
+    """The source itself; needed when ``config.guide`` is not ``none``."""
 
 
 def make_header(config: TrainConfig, env: VectorEnv, card: dict[str, Any]) -> PolicyHeader:

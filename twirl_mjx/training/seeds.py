@@ -21,6 +21,7 @@ from twirl_mjx.replay.mixed import MixedReplay
 from twirl_mjx.replay.ring import RingBuffer
 from twirl_mjx.training import state as single
 from twirl_mjx.training.config import TrainConfig
+from twirl_mjx.training.guidance import Guide
 from twirl_mjx.training.state import TrainState
 from twirl_mjx.types import Metrics
 from twirl_mjx.worlds.vector import VectorEnv
@@ -43,6 +44,7 @@ def per_field(batched: Any, shared: Any, *, own_sources: bool = False) -> Any:
         env_steps=shared,
         inserted=batched,
         share=batched,
+        guide=batched,
     )
 
 
@@ -51,7 +53,11 @@ AXES = per_field(0, None)
 
 
 def init_seeds(
-    config: TrainConfig, env: VectorEnv, seeds: Sequence[int], source: RingBuffer | None
+    config: TrainConfig,
+    env: VectorEnv,
+    seeds: Sequence[int],
+    source: RingBuffer | None,
+    guide: Guide | None = None,
 ) -> TrainState:
     """Return the states of several seeds before the first transition.
 
@@ -60,6 +66,7 @@ def init_seeds(
         env: Its worlds; every seed has ``env.num_envs`` of its own.
         seeds: S seeds; one may occur again where runs differ in phi.
         source: Frozen source experience that all seeds share, or None.
+        guide: Who else acts, one for all seeds, or None.
 
     Returns:
         A state with a leading axis [S] on every leaf but those of ``AXES`` without one.
@@ -72,23 +79,31 @@ def init_seeds(
     keys = jax.vmap(jax.random.key)(jnp.asarray(seeds, jnp.uint32))
 
     def fresh(key: jax.Array) -> TrainState:
-        return single.init(config, env, key, None)
+        return single.init(config, env, key, None, guide)
 
     states = jax.jit(jax.vmap(fresh, out_axes=AXES))(keys)
     return states.replace(replay=states.replay.replace(source=source))
 
 
 def batch_epoch(
-    config: TrainConfig, env: VectorEnv, *, own_sources: bool = False
+    config: TrainConfig,
+    env: VectorEnv,
+    *,
+    own_sources: bool = False,
+    guide: Guide | None = None,
 ) -> Callable[[TrainState], tuple[TrainState, Metrics]]:
     """Return ``train_epoch`` of a batch of seeds, not compiled; metrics are [S] each."""
-    epoch = functools.partial(single.train_epoch, config, env)
+    epoch = functools.partial(single.train_epoch, config, env, guide=guide)
     axes = per_field(0, None, own_sources=own_sources)
     return jax.vmap(epoch, in_axes=(axes,), out_axes=(axes, 0))
 
 
 def compile_epoch_seeds(
-    config: TrainConfig, env: VectorEnv, *, own_sources: bool = False
+    config: TrainConfig,
+    env: VectorEnv,
+    *,
+    own_sources: bool = False,
+    guide: Guide | None = None,
 ) -> Callable[[TrainState], tuple[TrainState, Metrics]]:
     """Return the jitted epoch of a batch of seeds; it donates its argument.
 
@@ -96,11 +111,12 @@ def compile_epoch_seeds(
         config: The run.
         env: The worlds of one seed.
         own_sources: Whether every seed has a source ring of its own (``stack_rings``).
+        guide: Who else acts, one for all seeds, or None.
 
     Returns:
         A function of a state from ``init_seeds``; its metrics are [S] each.
     """
-    return jax.jit(batch_epoch(config, env, own_sources=own_sources), donate_argnums=0)
+    return jax.jit(batch_epoch(config, env, own_sources=own_sources, guide=guide), donate_argnums=0)
 
 
 def num_seeds(states: TrainState) -> int:

@@ -6,12 +6,14 @@ The pipeline acts on the answer, and a sweep plans with it what has to be run fi
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from pathlib import Path
 
 from twirl_mjx.assets import asset_path
 from twirl_mjx.plugins import is_reference
-from twirl_mjx.policies.resolve import SCRIPTED_SOURCES, Terms
+from twirl_mjx.policies.resolve import SCRIPTED_SOURCES, Source, Terms, check_acts
 from twirl_mjx.training.config import TrainConfig
+from twirl_mjx.training.learners import learner_of
 from twirl_mjx.training.presets import make_config, source_task_of, starts_from_nominal_run
 
 
@@ -103,6 +105,49 @@ def check_source_is_used(config: TrainConfig, preset: str) -> None:
         raise ValueError(
             f"variant scratch uses no source: --source {config.source} would do nothing"
             " (nearest: --variant twirl)"
+        )
+
+
+def check_guide(config: TrainConfig, source: Source | None) -> None:
+    """Refuse a guide that cannot act, or that asks a critic which the learner has not.
+
+    Args:
+        config: The run.
+        source: The source itself, where it is not ``config.source`` that names it.
+
+    Raises:
+        ValueError: It is recorded data, or the learner has no ``value``.
+    """
+    if config.guide == "none":
+        return
+    if source is not None and source.data is not None:
+        raise ValueError(
+            f"guide {config.guide} asks the source for actions, and {source.origin} is recorded"
+            " data, which does not act (nearest: guide none)"
+        )
+    if source is None:
+        check_acts(config.source)
+    if config.guide == "best-of" and (learner := learner_of(config.droq)).value is None:
+        raise ValueError(
+            f"guide best-of asks the critic, and learner {learner.name} has no value (nearest:"
+            " guide jump-start)"
+        )
+
+
+def check_one_guide(configs: Sequence[TrainConfig], preset: str) -> None:
+    """Refuse a guide that differs from run to run of one program.
+
+    Raises:
+        ValueError: Every run has a run of its own as its source, or names another one.
+    """
+    config = configs[0]
+    if config.guide == "none" or len(configs) < 2:
+        return
+    others = any(other.source != config.source for other in configs)
+    if others or isinstance(source_of(config, preset), NominalRun | RunOf):
+        raise ValueError(
+            f"guide {config.guide} needs one source for all runs of a program, and each would have"
+            f" one of its own (nearest: --seed {config.seed})"
         )
 
 

@@ -17,10 +17,14 @@ from twirl_mjx.replay.mixed import MixedReplay
 from twirl_mjx.tasks import measures
 from twirl_mjx.tasks.measures import Tracker
 from twirl_mjx.training.config import TrainConfig
+from twirl_mjx.training.guidance import Guide
 from twirl_mjx.training.learners import learner_of
 from twirl_mjx.training.metrics import FIRST_DROP
 from twirl_mjx.types import Metrics, Transition
 from twirl_mjx.worlds.vector import EnvState, VectorEnv, make_transition
+
+GUIDE = 1
+"""What is folded into a step's key for a guide's draws."""
 
 
 class TrainState(flax.struct.PyTreeNode):
@@ -42,6 +46,8 @@ class TrainState(flax.struct.PyTreeNode):
     """int32, transitions inserted in the online ring, dropped ones excluded."""
     share: share_lib.Share | None = None
     """Source rows of a minibatch, where they are data; None: phi is a number when compiled."""
+    guide: Any = ()
+    """State of the guide (``guidance.GuideState``); nothing without one."""
 
 
 class EpisodeSums(flax.struct.PyTreeNode):
@@ -56,6 +62,7 @@ def init(
     env: VectorEnv,
     key: jax.Array,
     source: ring.RingBuffer | None,
+    guide: Guide | None = None,
 ) -> TrainState:
     """Return the state before the first transition.
 
@@ -64,13 +71,15 @@ def init(
         env: Its worlds.
         key: PRNG key of the run.
         source: Frozen source experience, or None.
+        guide: Who else acts, or None.
     """
     learner_key, env_key, key = jax.random.split(key, 3)
+    worlds = env.reset(env_key)
     return TrainState(
         learner=learner_of(config.droq).init(
             learner_key, config.droq, env.observation_size, env.action_size
         ),
-        env=env.reset(env_key),
+        env=worlds,
         replay=MixedReplay(
             source=source,
             online=ring.init(config.replay.capacity, env.observation_size, env.action_size),
@@ -82,26 +91,41 @@ def init(
         share=(
             share_lib.init(AUTO, config.droq.batch_size) if config.effective_phi == AUTO else None
         ),
+        guide=() if guide is None else guide.init(worlds),
     )
 
 
 def collect_step(
-    config: TrainConfig, env: VectorEnv, state: TrainState, key: jax.Array
+    config: TrainConfig,
+    env: VectorEnv,
+    state: TrainState,
+    key: jax.Array,
+    guide: Guide | None = None,
 ) -> tuple[TrainState, EnvState, jax.Array]:
     """Act once in every world and insert the transitions.
 
     Actions are uniformly random in the first ``warmup_env_steps`` transitions, unless the actor
-    begins with the weights of a source.
+    begins with the weights of a source; a guide may put others in their place.
 
     Returns:
         The new state, what the worlds returned, and why transitions were dropped: [N] int32
         indices into ``FAULTS``.
     """
     warm_key, act_key = jax.random.split(key)
-    action = learner_of(config.droq).sample(state.learner.actor, state.env.obs, act_key)
+    learner = learner_of(config.droq)
+    action = learner.sample(state.learner.actor, state.env.obs, act_key)
     if not config.uses_source_weights:
         warm = jax.random.uniform(warm_key, action.shape, minval=-1.0, maxval=1.0)
         action = jnp.where(state.env_steps < config.warmup_env_steps, warm, action)
+    if guide is not None:
+        value = learner.value and functools.partial(
+            learner.value, state.learner, config.droq, state.env.obs
+        )
+        guide_key = jax.random.fold_in(key, GUIDE)
+        noted, action = guide.choose(
+            state.guide, state.env, state.env_steps, action, value, guide_key
+        )
+        state = state.replace(guide=noted)
     result, fault = env.step_and_fault(state.env, action)
     valid = ~result.invalid
     transition = make_transition(state.env, jnp.nan_to_num(action), result)
@@ -155,7 +179,7 @@ def update_blocks(config: TrainConfig, state: TrainState, key: jax.Array) -> tup
 
 
 def train_step(
-    config: TrainConfig, env: VectorEnv, state: TrainState
+    config: TrainConfig, env: VectorEnv, state: TrainState, guide: Guide | None = None
 ) -> tuple[TrainState, tuple[Metrics, Metrics, EpisodeSums]]:
     """One vector step and its updates.
 
@@ -164,7 +188,7 @@ def train_step(
         over the episodes that ended.
     """
     key, act_key, update_key = jax.random.split(state.key, 3)
-    state, result, fault = collect_step(config, env, state.replace(key=key), act_key)
+    state, result, fault = collect_step(config, env, state.replace(key=key), act_key, guide)
     tracker = measures.tracker_step(env.task, state.tracker, result)
     done = result.done & ~result.invalid
     finished = EpisodeSums(
@@ -182,11 +206,14 @@ def train_step(
         "dropped_transitions": jnp.sum(result.invalid, dtype=jnp.float32),
         FIRST_DROP: jnp.max(fault).astype(jnp.float32),
     }
+    if guide is not None:
+        noted, told = guide.note(state.guide, finished.values["return"], finished.count)
+        state, worlds = state.replace(guide=noted), worlds | told
     return state.replace(learner=learner), (learner_metrics, worlds, finished)
 
 
 def train_epoch(
-    config: TrainConfig, env: VectorEnv, state: TrainState
+    config: TrainConfig, env: VectorEnv, state: TrainState, guide: Guide | None = None
 ) -> tuple[TrainState, Metrics]:
     """Run ``steps_per_epoch`` vector steps; the body of the only training jit.
 
@@ -194,7 +221,7 @@ def train_epoch(
         The new state and scalar metrics of the epoch; NaN where nothing was measured.
     """
     state, (learning, worlds, finished) = jax.lax.scan(
-        lambda s, _: train_step(config, env, s), state, length=config.steps_per_epoch
+        lambda s, _: train_step(config, env, s, guide), state, length=config.steps_per_epoch
     )
     metrics = {name: jnp.nanmean(value) for name, value in learning.items()}
     metrics |= {name: jnp.mean(value) for name, value in worlds.items()}
@@ -222,7 +249,7 @@ def train_epoch(
 
 
 def compile_epoch(
-    config: TrainConfig, env: VectorEnv
+    config: TrainConfig, env: VectorEnv, guide: Guide | None = None
 ) -> Callable[[TrainState], tuple[TrainState, Metrics]]:
     """Return the jitted epoch; it donates its argument."""
-    return jax.jit(functools.partial(train_epoch, config, env), donate_argnums=0)
+    return jax.jit(functools.partial(train_epoch, config, env, guide=guide), donate_argnums=0)
