@@ -78,6 +78,9 @@ class Probe:
         return after, jnp.zeros(WORLDS, jnp.int32)
 
 
+PROBE: Any = Probe()
+
+
 class Constant:
     """A source that always does the same, and counts how often it was asked."""
 
@@ -112,15 +115,15 @@ def probe_config(guide: str) -> TrainConfig:
 
 def fresh(config: TrainConfig, guide: Guide | None) -> Any:
     """Return the state before the first step in the probe."""
-    make = jax.jit(lambda key: state.init(config, Probe(), key, None, guide))  # type: ignore[arg-type]
+    make = jax.jit(lambda key: state.init(config, PROBE, key, None, guide))
     return make(jax.random.key(0))
 
 
 def run_probe(kind: str, epochs: int) -> tuple[Any, list[dict[str, float]]]:
     """Train beside a source that does the best; return the last state and metrics by epoch."""
-    config, env = probe_config(kind), Probe()
+    config, env = probe_config(kind), PROBE
     guide = Guide(config, Constant(BEST))
-    epoch = state.compile_epoch(config, env, guide)  # type: ignore[arg-type]
+    epoch = state.compile_epoch(config, env, guide)
     now, told = fresh(config, guide), []
     for _ in range(epochs):
         now, metrics = epoch(now)
@@ -157,11 +160,11 @@ def test_the_horizon_shrinks_to_nothing_beside_a_source_that_can_be_reached() ->
 
 
 def test_without_a_guide_nothing_is_kept_or_logged() -> None:
-    config, env = probe_config("none"), Probe()
+    config, env = probe_config("none"), PROBE
     first = jax.eval_shape(lambda: fresh(config, None))
     after, metrics = jax.eval_shape(
         lambda now: state.train_epoch(config, env, now),
-        first,  # type: ignore[arg-type]
+        first,
     )
     assert first.guide == after.guide == ()
     assert not {"guided", "guide_horizon"} & metrics.keys()
@@ -244,7 +247,7 @@ def test_guides_that_cannot_work_are_refused(monkeypatch: pytest.MonkeyPatch) ->
         ):
             dataclasses.replace(config, variant=variant, guide="best-of")
     guided = dataclasses.replace(config, guide="best-of")
-    rows = Transition(*(np.zeros((1, 1), np.float32) for _ in range(5)))
+    rows = Transition(*[jnp.zeros((1, 1))] * 5)
     data: Any = Source(Constant(0.0), "mine.npz", "d", data=rows)
     with pytest.raises(ValueError, match=r"mine\.npz is recorded data, which does not act"):
         source_rules.check_guide(guided, data)

@@ -31,7 +31,7 @@ RANGES = {
 
 CONTACTS = {
     "plain": ((0.02, 1.0), (0.9, 0.95, 0.001)),
-    "soft": ((0.06, 1.0), (0.8, 0.9, 0.005)),
+    "soft": ((0.03, 1.0), (0.85, 0.95, 0.002)),
     "hard": ((0.004, 1.0), (0.97, 0.995, 0.0005)),
 }
 """Contact -> MuJoCo's ``solref`` (time constant in s, damping ratio) and ``solimp`` (least and

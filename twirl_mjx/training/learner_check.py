@@ -43,7 +43,7 @@ def check_learner(config: LearnerConfig, observation_size: int, action_size: int
         if (value := learner.value) is not None:
             at = "value"
             found = jax.eval_shape(
-                lambda s, o, a: value(s, config, o, a), state, obs[0], minibatches.action[0]
+                lambda s, m: value(s, config, m.obs[0], m.action[0]), state, minibatches
             )
             _expect(found, jax.ShapeDtypeStruct(minibatches.reward.shape[1:], jnp.float32))
         at = "update"
