@@ -270,7 +270,9 @@ def test_guides_that_cannot_work_are_refused(monkeypatch: pytest.MonkeyPatch) ->
 @pytest.mark.slow
 @pytest.mark.parametrize("guide", ["jump-start", "best-of"])
 def test_a_guided_run_resumes_bit_for_bit(guide: str, tmp_path: Path) -> None:
-    config = dataclasses.replace(make_config("biped", "debug"), guide=guide, source="trot")
+    config = dataclasses.replace(
+        make_config("stand", "debug"), variant="twirl", guide=guide, source="trot", engine="native"
+    )
 
     def train(config: TrainConfig, name: str) -> Any:
         pipeline.run(config, "debug", tmp_path, name, lambda _: None)
