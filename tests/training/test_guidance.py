@@ -254,7 +254,9 @@ def test_guides_that_cannot_work_are_refused(monkeypatch: pytest.MonkeyPatch) ->
     source_rules.check_guide(config, data)
     trained = dataclasses.replace(guided, source="train")
     with pytest.raises(ValueError, match=r"one source for all runs .*nearest: --seed 3"):
-        source_rules.check_one_guide([dataclasses.replace(trained, seed=s) for s in (3, 4)], "debug")
+        source_rules.check_one_guide(
+            [dataclasses.replace(trained, seed=s) for s in (3, 4)], "debug"
+        )
     trot = dataclasses.replace(guided, source="trot")
     source_rules.check_one_guide([trot, dataclasses.replace(trot, seed=4)], "debug")
     with pytest.raises(ValueError, match="one source for all runs"):
