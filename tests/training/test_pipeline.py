@@ -295,7 +295,7 @@ def test_source_data_hold_whole_episodes_and_one_program_collects_for_all_seeds(
         rewards.append(data.reward)
     (collector,) = collectors.values()
     assert collector.env.num_envs == biped.replay.source_size // biped.eval.episode_length
-    assert collector._run._cache_size() == 1
+    assert collector._run._cache_size() == 1  # type: ignore[attr-defined]
     assert not np.array_equal(*rewards)
 
 
