@@ -250,6 +250,7 @@ BRIEF = {
     ' make report ARGS="--results build/one"',
     r"(make sweep .*--reduced)\"$": r'\1 --dry-run"',
     r"(.*twirl train .*--seeds) 0 1 2 3(.*)": rf"\1 0 1\2 {SHORT}",
+    r"(.*twirl train .*) --and (.*)": rf"\1 {SHORT} --and \2 {SHORT}",
     r"(.*twirl train .*trot48.*)": rf"\1 {SHORT}",
     r"(.*twirl render .*)": r"\1 --seconds 1 --panels 2",
     r"(.*twirl rehearse .*)": r"\1 --episodes 1 --robot.episode-s 2",
