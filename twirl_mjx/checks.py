@@ -64,6 +64,11 @@ def check_printable(what: str, text: str) -> None:
         raise ValueError(f"{what} {text!a} has characters that cannot be seen (nearest: {seen!r})")
 
 
+def one_line(text: object) -> str:
+    """Return text out of a file as it can stand in a message: what cannot be seen is escaped."""
+    return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in str(text))
+
+
 def check_range(what: str, value: float, low: float, high: float) -> None:
     """Refuse a number outside [low, high].
 

@@ -233,3 +233,20 @@ def test_numbers_that_float32_cannot_hold_are_refused(
     array_files.write_npz(path, {"header": np.array(text)} | data)
     with pytest.raises(ValueError, match=rf"a\.npz: obs .*{message}"):
         dataset.read(path, task="stand", observation_size=2, action_size=1)
+
+
+def test_names_out_of_a_file_cannot_break_the_line(tmp_path: Path) -> None:
+    """Keys and fields with line breaks, found by the fuzzer."""
+    clip = json.loads(asset_path("a1", "leap.json").read_text())
+    clip["Order\n\x13\u2028é"] = clip.pop("Frames")
+    (tmp_path / "a.json").write_text(json.dumps(clip))
+    with pytest.raises(ValueError, match="key Frames is missing") as refused:
+        read_clip(tmp_path / "a.json")
+    assert str(refused.value).isprintable()
+    assert r"Order\n\x13\u2028é" in str(refused.value)
+    header = dataclasses.asdict(dataset.DatasetHeader("t", "none", "s", 1, 2, 2, 0.0))
+    record = {"format": dataset.FORMAT, "version": dataset.VERSION, **header, "a\n\x82": 1}
+    np.savez(tmp_path / "a.npz", header=np.array(json.dumps(record)))
+    with pytest.raises(dataset.DatasetError, match="the header has wrong fields") as refused:
+        dataset.read(tmp_path / "a.npz", task="t", observation_size=2, action_size=2)
+    assert str(refused.value).isprintable()

@@ -31,6 +31,7 @@ from typing import Any, Literal
 import numpy as np
 
 from twirl_mjx import array_files, files
+from twirl_mjx.checks import one_line
 from twirl_mjx.motion.clip import Clip, LoopMode, frame_velocities, rotation_of
 from twirl_mjx.motion.conversion import AS_IS, NUM_JOINTS, POSE_SIZE, Conversion
 from twirl_mjx.sim import kinematics
@@ -155,7 +156,8 @@ def _value(path: Path, data: dict[str, Any], key: str) -> Any:
     if key not in data and "LegOrder" in data and key in DEFAULTS:
         return DEFAULTS[key]
     if key not in data:
-        raise ValueError(f"{path}: key {key} is missing (keys present: {', '.join(data)})")
+        present = one_line(", ".join(data))
+        raise ValueError(f"{path}: key {key} is missing (keys present: {present})")
     return data[key]
 
 

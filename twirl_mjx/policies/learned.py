@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from twirl_mjx import array_files, files
+from twirl_mjx.checks import one_line
 
 if TYPE_CHECKING:
     from twirl_mjx.policies.onnx_file import OnnxPolicy
@@ -116,7 +117,7 @@ class PolicyHeader:
         except PolicyFileError:
             raise
         except (TypeError, ValueError, OverflowError) as error:
-            raise PolicyFileError(f"the header has wrong fields: {error}") from error
+            raise PolicyFileError(f"the header has wrong fields: {one_line(error)}") from error
 
     def component(self, index: int) -> str:
         """Name observation component ``index``, for example ``joint_pos[3] (rad)``."""

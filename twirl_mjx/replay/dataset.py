@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from twirl_mjx import array_files, files
+from twirl_mjx.checks import one_line
 from twirl_mjx.types import Transition
 
 FORMAT = "twirl-source-dataset"
@@ -123,4 +124,4 @@ def _load(path: Path) -> tuple[DatasetHeader, dict[str, np.ndarray]]:
     try:
         return DatasetHeader(**record), arrays
     except TypeError as error:
-        raise DatasetError(f"{path}: the header has wrong fields: {error}") from error
+        raise DatasetError(f"{path}: the header has wrong fields: {one_line(error)}") from error
