@@ -79,6 +79,12 @@ def test_a_scripted_source_does_what_a_numpy_policy_does() -> None:
         (["zero", "--task", "biped", "--out", "r.txt"], r"need \.json or \.csv \(nearest: r\.csv"),
         (["zero", "--task", "biped", "--film", "r.gif"], r"is no \.mp4 \(nearest: r\.mp4"),
         (["zero", "--task", "biped", "--dynamics.friction", "0.3"], "nearest: --robot.friction"),
+        (["zero", "--task", "biped", "--biped.goal-speed", "0.1"], "nearest: --robot.goal-speed"),
+        (["zero", "--task", "hurdles", "--hurdles.gap", "2.4"], "nearest: --robot.hurdle-gap"),
+        (
+            ["zero", "--task", "hurdles", "--hurdles.min-gap", "2"],
+            "has its own .nearest: without it",
+        ),
         (["zero", "--task", "biped", "--source-contract", "go1_joystick"], "would do nothing"),
         (["zero", "--task", "jump"], "jump"),
     ],

@@ -142,7 +142,16 @@ def _options_of(policy: str, task: str | None, overrides: dict[str, dict[str, An
             f"--{name} sets the worlds of training, not the rehearsed robot (nearest:"
             " --robot.friction)"
         )
-    return with_overrides(config_of(policy, task), overrides).options
+    config = with_overrides(config_of(policy, task), overrides)
+    for name in overrides.get(config.task, {}):
+        if name in config.task_type.course_options:
+            own = [f.name for f in dataclasses.fields(RehearsalConfig) if f.name.endswith(name)]
+            what = f"--robot.{own[0].replace('_', '-')}" if own else "without it"
+            raise ValueError(
+                f"--{config.task}.{name.replace('_', '-')} places the course of training worlds,"
+                f" and the rehearsal has its own (nearest: {what})"
+            )
+    return config.options
 
 
 def print_table(policy: str, result: Rehearsal) -> None:
