@@ -4,19 +4,23 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from twirl_mjx.checks import check_choice, check_once
+from twirl_mjx.checks import check_choice, check_once, check_range
 from twirl_mjx.commands.console import parse, say
 from twirl_mjx.commands.options import default_preset
+from twirl_mjx.commands.waiting import waiting
 from twirl_mjx.sim.leaves import PAPER_SHIFTS, SHIFTS
 from twirl_mjx.sweep.grid import configure
 from twirl_mjx.tasks.registry import TASKS
 from twirl_mjx.tasks.task import Link
 from twirl_mjx.training.config import TrainConfig
 from twirl_mjx.training.presets import PRESETS
+
+if TYPE_CHECKING:
+    from twirl_mjx.sweep.contest import Contest
 
 ADAPTATION_ENV_STEPS = 100_000
 """Transitions of an adaptation run (paper, section "Transfer to New Environments")."""
@@ -26,10 +30,11 @@ ADAPTATION_ENV_STEPS = 100_000
 class CurriculumOptions:
     """Train a chain unattended: easier tasks first, the target task, then every dynamics shift.
 
-    With --source the target task starts from that source, and the easier tasks are left out.
+    With --source the target task starts from that source, and the easier tasks are left out. With
+    --sources no chain is given: sources and easier tasks compete for the target (--budget, ...).
     """
 
-    task: str = TrainConfig.task
+    task: Annotated[str, tyro.conf.arg(aliases=["--target"])] = TrainConfig.task
     """Target task at the heart of the chain."""
     preset: Annotated[str, tyro.conf.arg(help="paper, cpu, massive or debug")] = ""
     """Settings; cpu without an accelerator, else paper."""
@@ -37,8 +42,8 @@ class CurriculumOptions:
     """Seed of every run."""
     runs: Path = Path("runs")
     """Folder of all runs."""
-    shifts: tuple[str, ...] = PAPER_SHIFTS[1:]
-    """Shifts to adapt to."""
+    shifts: tuple[str, ...] | None = None
+    """Shifts to adapt to; all five after a chain, none after a contest by default."""
     source: str = ""
     """Source of the target task instead of the easier ones: whatever twirl train takes."""
     source_contract: str = ""
@@ -47,6 +52,38 @@ class CurriculumOptions:
     """What a foreign source is told to do: 0.5,0,0 or towards-goal:0.5."""
     allow_clipping: bool = False
     """Record a source although more than 20 % of its joint targets lie outside the action box."""
+    sources: tuple[str, ...] = ()
+    """Sources that compete: tasks with a shipped policy, or whatever --source takes; NAME=SOURCE
+    gives another name."""
+    budget: int = 2_400_000
+    """Of a contest: transitions in all."""
+    rounds: int = 3
+    """Of a contest: rounds; the winner of one is a source of the next."""
+    measure: str = ""
+    """Of a contest: the measure of the target task that decides; the task's aim by default."""
+    episodes: int = 100
+    """Of a contest: episodes by which a candidate is judged."""
+    minutes: float | None = None
+    """Save and stop after this wall time; the same command goes on."""
+    name: str | None = None
+    """Of a contest: its name, with which its runs begin."""
+
+    def __post_init__(self) -> None:
+        """Refuse options that would do nothing.
+
+        Raises:
+            ValueError: They belong to a contest and there is none, or the other way round.
+        """
+        contest = ("budget", "rounds", "measure", "episodes", "name")
+        chain = ("shifts", "source")
+        names, other = (chain, "drop --sources") if self.sources else (contest, "add --sources")
+        defaults = {field.name: field.default for field in dataclasses.fields(self)}
+        for name in names:
+            if (value := getattr(self, name)) != defaults[name]:
+                told = " ".join(value) if isinstance(value, tuple) else value
+                raise ValueError(f"--{name} {told} would do nothing here (nearest: {other})")
+        if self.minutes is not None:
+            check_range("minutes", self.minutes, 0.001, 1e7)
 
 
 def chain_of(task: str) -> tuple[Link, ...]:
@@ -75,7 +112,7 @@ def plan(options: CurriculumOptions, preset: str) -> list[tuple[str, TrainConfig
         links.append((chained if links else default_name(config, preset), config))
     target, config = links[-1]
     budget = min(ADAPTATION_ENV_STEPS, config.total_env_steps)
-    for shift in options.shifts:
+    for shift in shifts_of(options):
         adapted = dataclasses.replace(
             config,
             shift=shift,
@@ -86,6 +123,11 @@ def plan(options: CurriculumOptions, preset: str) -> list[tuple[str, TrainConfig
         )
         links.append((f"{task}-{shift}-chain-{preset}-s{options.seed}", adapted))
     return links
+
+
+def shifts_of(options: CurriculumOptions) -> tuple[str, ...]:
+    """Return the shifts at the end of the chain."""
+    return PAPER_SHIFTS[1:] if options.shifts is None else options.shifts
 
 
 def given_source(options: CurriculumOptions) -> dict[str, str | bool]:
@@ -114,14 +156,81 @@ def main(argv: list[str]) -> int:
     options = parse(CurriculumOptions, argv, "twirl curriculum")
     preset = options.preset or default_preset()
     check_choice("preset", preset, PRESETS)
-    options = dataclasses.replace(options, shifts=tuple(map(SHIFTS.admit, options.shifts)))
-    check_once("--shifts", options.shifts)
+    if options.sources:
+        return compete(options, preset)
+    shifts = tuple(map(SHIFTS.admit, shifts_of(options)))
+    options = dataclasses.replace(options, shifts=shifts)
+    check_once("--shifts", shifts)
     from twirl_mjx.training import pipeline, source_rules
 
     links = plan(options, preset)
     for _, config in links:  # the last link would be refused after hours of those before it
         source_rules.check_source_is_used(config, preset)
+    deadline = pipeline.deadline_after(options.minutes)
     for number, (name, config) in enumerate(links, 1):
         say(f"link {number} of {len(links)}: {name}")
-        pipeline.run(config, preset, options.runs, name, say)
+        pipeline.run(config, preset, options.runs, name, say, deadline=deadline)
     return 0
+
+
+def compete(options: CurriculumOptions, preset: str) -> int:
+    """Hold a contest; draw its tree, however it ends."""
+    with waiting("loading the trainer"):
+        from twirl_mjx.policies.resolve import Terms
+        from twirl_mjx.sweep.contest import Contest, Rules
+        from twirl_mjx.training import pipeline
+    terms = Terms(options.source_contract, options.source_command, options.allow_clipping)
+    rules = Rules(
+        task=options.task,
+        preset=preset,
+        seed=options.seed,
+        sources=tuple(map(entrant, options.sources)),
+        budget=options.budget,
+        rounds=options.rounds,
+        measure=options.measure,
+        episodes=options.episodes,
+        terms=terms,
+    )
+    name = options.name or f"{TASKS.get(rules.task).name}-contest-{preset}-s{options.seed}"
+    with waiting("looking at the sources"):
+        deadline = pipeline.deadline_after(options.minutes)
+        contest = Contest(rules, options.runs, name, say, deadline)
+    try:
+        winner = contest.hold()
+    finally:
+        draw(contest)
+    say(contest.summary(winner))
+    return 0
+
+
+def entrant(word: str) -> tuple[str, str]:
+    """Return name and ``--source`` of a source that competes.
+
+    Raises:
+        ValueError: A task of which no policy is shipped.
+    """
+    from twirl_mjx.assets import asset_path
+    from twirl_mjx.commands.tables import named
+    from twirl_mjx.sweep.contest import slug
+
+    name, given = named(word)
+    if given in TASKS.names():
+        try:
+            return (given if name == word else name), str(asset_path("policies", f"{given}.npz"))
+        except FileNotFoundError:
+            raise ValueError(
+                f"no policy of task {given} is shipped (nearest: train one, twirl train --task"
+                f" {given}, and name its run)"
+            ) from None
+    return (slug(given) if given == word else name), given
+
+
+def draw(contest: Contest) -> None:
+    """Draw the tree of a contest as far as it went."""
+    if not any(row.run for row in contest.rows):
+        return
+    from twirl_mjx.figures.canvas import write_png
+    from twirl_mjx.figures.tree import contest_tree
+
+    figure = contest_tree(contest.rows, contest.told_measure, f"Contest {contest.name}")
+    say(f"wrote {write_png(figure, contest.folder / 'tree.png')}")

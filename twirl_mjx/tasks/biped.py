@@ -90,9 +90,13 @@ class Biped(Task[BipedOptions]):
         "mean_distance": Measure(
             "goal_distance", "mean", 1.0, "m", "mean distance to the goal", smaller_is_better=True
         ),
+        "goal_time": Measure(
+            "at_goal", "time", 1.0, "s", "time upright, weighted by exp(-distance to the goal / m)"
+        ),
         "cosine": STANDING_MEASURES["cosine"],
     }
     lead = ("return", "standing_time", "on_feet", "success")
+    aim = "goal_time"
     chain = (
         Link("stand", {"task": "stand"}),
         Link("walk", {"task": "biped"} | WALK),
@@ -138,6 +142,7 @@ class Biped(Task[BipedOptions]):
         progress = self._progress(distance, world.task.previous_distance)
         weight = self.options.distance_weight
         fall = base.touches(view, TRUNK, HIP, THIGH)
+        standing = base.standing_metrics(view, x_axis[2])
         return base.Outcome(
             reward=(upright + bonus) * (1.0 + facing + weight * progress),
             terminated=fall,
@@ -150,8 +155,9 @@ class Biped(Task[BipedOptions]):
                 "facing": facing,
                 "distance": progress,
                 "cosine": x_axis[2],
-                **base.standing_metrics(view, x_axis[2]),
+                **standing,
                 "goal_distance": distance,
+                "at_goal": standing["standing"] * jnp.exp(-distance),
                 "fall": fall,
             },
         )

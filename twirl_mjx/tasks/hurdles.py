@@ -178,6 +178,7 @@ class Hurdles(Task[HurdlesOptions]):
     }
     lead = ("hurdles_passed", "single_flight", "return")
     ratios = {"single_flight": ("clean_clearances", "hurdles_passed")}
+    aim = "clean_clearances"
     chain = (
         Link("imitate", {"task": "imitate"}),
         Link("hurdles", {"task": "hurdles"}),

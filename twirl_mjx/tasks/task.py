@@ -85,6 +85,8 @@ class Task[O]:
     """Measures that figures and tables compute: the first over the second, where not zero."""
     source: ClassVar[str | None] = None
     """Name of the task whose trained policy is the default source."""
+    aim: ClassVar[str] = ""
+    """Measure by which candidates for a curriculum compete; the first of ``lead`` by default."""
     chain: ClassVar[tuple[Link, ...]] = ()
     """Runs that lead to a skill one after another; the sources, then the task, where empty."""
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {}

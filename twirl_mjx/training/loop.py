@@ -376,9 +376,13 @@ def train(
 def final_evaluation(runs: Sequence[Run]) -> list[dict[str, np.ndarray]]:
     """Evaluate the best policy of every run on fresh seeds; return measures [E] of each."""
     config = runs[0].config
-    actors: list[Any] = []
-    for policy in (load_policy(run.run_dir.policy) for run in runs):
-        assert isinstance(policy, NumpyPolicy), "a run writes .npz policies"
-        actors.append(jax.tree.map(jnp.asarray, dict(policy.actor_params)))
+    actors = [actor_of(run.run_dir) for run in runs]
     evaluate = program.compile_evaluation(config, len(runs), config.eval.final_episodes)
     return evaluate(program.join(actors), jax.random.key(config.eval.seed + 1))
+
+
+def actor_of(run_dir: RunDir) -> Any:
+    """Return the parameters of the best policy of a run."""
+    policy = load_policy(run_dir.policy)
+    assert isinstance(policy, NumpyPolicy), "a run writes .npz policies"
+    return jax.tree.map(jnp.asarray, dict(policy.actor_params))
