@@ -78,6 +78,9 @@ def test_reward_by_hand(judge: Callable[..., Outcome]) -> None:
     np.testing.assert_allclose(outcome.reward, expected, rtol=1e-5)
     np.testing.assert_allclose(outcome.metrics["goal_distance"], [0.8, 0.5, 0.005], atol=1e-6)
     np.testing.assert_allclose(outcome.task.previous_distance, [0.8, 0.5, 0.005], atol=1e-6)
+    near = np.exp([-0.8, -0.5, -0.005]) * np.asarray(outcome.metrics["standing"])
+    assert np.all(near > 0), "upright with its front feet in the air"
+    np.testing.assert_allclose(outcome.metrics["at_goal"], near, rtol=1e-5)
     away = judge(task, [raised(0.2)], previous=0.8)  # not nearer than before
     np.testing.assert_allclose(away.reward, 1.6487213 * 2.0, rtol=1e-5)
     four = judge(task, [raised(0.0, pitch_up=0.0, z=0.27)], previous=2.0)

@@ -24,6 +24,7 @@ def make_step(reward: list, standing: list, distance: list, terminated: list) ->
             "standing": jnp.array(standing),
             "on_feet": zeros,
             "goal_distance": jnp.array(distance),
+            "at_goal": jnp.array(standing) * jnp.exp(-jnp.array(distance)),
             "cosine": zeros + 0.5,
         },
     )
@@ -46,6 +47,9 @@ def test_biped_measures_by_hand() -> None:
     np.testing.assert_allclose(
         values["mean_distance"], [0.5, 0.5]
     )  # (0.9 + 0.1) / 2, (0.4 + 0.6) / 2
+    # 0.05 s of each step upright: exp(-0.9) and exp(-0.1) m from the goal, then exp(-0.6)
+    at_goal = [0.05 * (0.4065697 + 0.9048374), 0.05 * 0.5488116]
+    np.testing.assert_allclose(values["goal_time"], at_goal, rtol=1e-5)
     np.testing.assert_allclose(values["terminated"], [0.0, 1.0])
     np.testing.assert_allclose(values["success"], [0.0, 0.0])
     after = measures.tracker_reset(BIPED, tracker, jnp.array([True, False]))

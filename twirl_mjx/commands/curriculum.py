@@ -24,6 +24,10 @@ if TYPE_CHECKING:
 
 ADAPTATION_ENV_STEPS = 100_000
 """Transitions of an adaptation run (paper, section "Transfer to New Environments")."""
+CONTEST = ("budget", "rounds", "measure", "episodes", "name")
+"""Options of a contest only."""
+CHAIN = ("shifts", "source")
+"""Options of a chain only."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -67,23 +71,6 @@ class CurriculumOptions:
     """Save and stop after this wall time; the same command goes on."""
     name: str | None = None
     """Of a contest: its name, with which its runs begin."""
-
-    def __post_init__(self) -> None:
-        """Refuse options that would do nothing.
-
-        Raises:
-            ValueError: They belong to a contest and there is none, or the other way round.
-        """
-        contest = ("budget", "rounds", "measure", "episodes", "name")
-        chain = ("shifts", "source")
-        names, other = (chain, "drop --sources") if self.sources else (contest, "add --sources")
-        defaults = {field.name: field.default for field in dataclasses.fields(self)}
-        for name in names:
-            if (value := getattr(self, name)) != defaults[name]:
-                told = " ".join(value) if isinstance(value, tuple) else value
-                raise ValueError(f"--{name} {told} would do nothing here (nearest: {other})")
-        if self.minutes is not None:
-            check_range("minutes", self.minutes, 0.001, 1e7)
 
 
 def chain_of(task: str) -> tuple[Link, ...]:
@@ -151,9 +138,28 @@ def given_source(options: CurriculumOptions) -> dict[str, str | bool]:
     )
 
 
+def check_together(options: CurriculumOptions) -> None:
+    """Refuse options that would do nothing.
+
+    Raises:
+        ValueError: They belong to a contest and there is none, or the other way round.
+    """
+    names, nearest = CONTEST, "add --sources"
+    if options.sources:
+        names, nearest = CHAIN, "drop --sources"
+    defaults = {field.name: field.default for field in dataclasses.fields(options)}
+    for name in names:
+        if (value := getattr(options, name)) != defaults[name]:
+            told = " ".join(value) if isinstance(value, tuple) else value
+            raise ValueError(f"--{name} {told} would do nothing here (nearest: {nearest})")
+    if options.minutes is not None:
+        check_range("minutes", options.minutes, 0.001, 1e7)
+
+
 def main(argv: list[str]) -> int:
     """Run the chain; links that are finished are skipped, an interrupted one resumes."""
     options = parse(CurriculumOptions, argv, "twirl curriculum")
+    check_together(options)
     preset = options.preset or default_preset()
     check_choice("preset", preset, PRESETS)
     if options.sources:

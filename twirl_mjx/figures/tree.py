@@ -9,9 +9,9 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from twirl_mjx.figures.canvas import canvas, steps_axis
+from twirl_mjx.figures.decisions import DROPPED, GOES_ON, Decision, ancestry
 from twirl_mjx.figures.tables import ARM_COLUMN, Table
 from twirl_mjx.figures.wording import numbers
-from twirl_mjx.sweep.contest import Decision, ancestry
 
 _ROW = 0.36
 """Inches of a run."""
@@ -50,7 +50,7 @@ def contest_tree(
                 above = places[mine[0].source]
                 axes.plot([xs[0]] * 2, [above, places[run]], color=colour, lw=1.0)
             for x, row in zip(xs[1:], mine, strict=True):
-                marker = "x" if row.kept == 0 else "o"
+                marker = "x" if row.kept == DROPPED else "o"
                 axes.plot(x, places[run], marker=marker, color=colour, ms=5)
                 axes.annotate(
                     numbers(row.value)[0], (x, places[run]), (0, 4), textcoords="offset points",
@@ -77,7 +77,7 @@ def contest_tree(
 
 def _winner(judged: Sequence[Decision]) -> str:
     """Return the run that was kept last, else the one that was judged last."""
-    kept = [row.run for row in judged if row.kept == 1]
+    kept = [row.run for row in judged if row.kept == GOES_ON]
     return kept[-1] if kept else judged[-1].run
 
 

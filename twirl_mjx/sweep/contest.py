@@ -27,20 +27,26 @@ import numpy as np
 
 from twirl_mjx import files
 from twirl_mjx.checks import check_choice, check_once, check_range
-from twirl_mjx.figures.statistics import bootstrap, mean
+from twirl_mjx.figures.decisions import (
+    Decision,
+    ancestry,
+    estimate,
+    read_decisions,
+    shown,
+    write_decisions,
+)
 from twirl_mjx.policies.resolve import PLAIN, Source, Terms, resolve_policy, takes_terms
 from twirl_mjx.sweep.grid import configure
 from twirl_mjx.tasks.measures import measures_of
 from twirl_mjx.tasks.registry import TASKS
 from twirl_mjx.tasks.task import Link
-from twirl_mjx.training import pipeline, program
+from twirl_mjx.training import pipeline, program, source_rules
 from twirl_mjx.training.config import TrainConfig, of_program
 from twirl_mjx.training.guards import DivergedError
 from twirl_mjx.training.loop import actor_of
 from twirl_mjx.training.presets import make_config
 from twirl_mjx.training.rundir import RunDir, check_name
 from twirl_mjx.training.weights import source_weights
-from twirl_mjx.worlds.make import make_env
 
 Say = Callable[[str], None]
 
@@ -121,35 +127,6 @@ class Candidate(NamedTuple):
     """Transitions it has had before this round."""
 
 
-class Decision(NamedTuple):
-    """How a candidate was judged at the end of a rung; a row of the table."""
-
-    round: int
-    """0: a source as it is, which nothing was trained for."""
-    rung: int
-    run: str
-    """Empty for a source as it is."""
-    stage: str
-    source: str
-    env_steps: int
-    """Transitions of the run so far."""
-    spent: int
-    """Transitions of the contest so far."""
-    value: float
-    """Mean of the measure; NaN where the run diverged, or the source does not act."""
-    low: float
-    high: float
-    """95 % interval over episodes."""
-    kept: int
-    """1: goes on, 0: is dropped, -1: not decided."""
-
-
-CELLS: dict[str, Callable[[str], Any]] = {
-    "round": int, "rung": int, "run": str, "stage": str, "source": str, "env_steps": int,
-    "spent": int, "value": float, "low": float, "high": float, "kept": int,
-}  # fmt: skip
-
-
 def stages_of(task: str) -> tuple[Link, ...]:
     """Return the target task and the easier ones of its family, as its chain has them."""
     own = tuple(link for link in TASKS.get(task).chain if link.settings["task"] == task)
@@ -219,19 +196,24 @@ class Contest:
         self.target = dataclasses.replace(self.target, seed=rules.seed)
         self.rows: list[Decision] = []
         self._resume()
-        self.entrants = {
-            word: resolve_policy(
-                given,
-                self.target.evaluation,
-                terms=rules.terms if takes_terms(given) else PLAIN,
-            )
-            for word, given in rules.sources
-        }
+        self.entrants = {word: self._entrant(given) for word, given in rules.sources}
         for candidate in self.first():
             pipeline.check_early(candidate.config, rules.preset, RunDir(runs / candidate.run))
         self._judge = program.compile_evaluation(self.target, 1, rules.episodes)
         # Neither the seed of evaluations in training nor that of closing ones: it serves choices.
         self._key = jax.random.key(self.target.eval.seed + 2)
+
+    def _entrant(self, given: str) -> Source:
+        """Return a source that competes.
+
+        Raises:
+            FileNotFoundError: There is nothing of that name; the message has the nearest.
+        """
+        config = dataclasses.replace(self.target, source=given)
+        rule = source_rules.source_of(config, self.rules.preset)
+        given = pipeline.place_of(rule, config, self.rules.preset, self.runs)
+        terms = self.rules.terms if takes_terms(given) else PLAIN
+        return resolve_policy(given, self.target.evaluation, terms=terms)
 
     def _resume(self) -> None:
         """Take over what was decided before.
@@ -256,8 +238,7 @@ class Contest:
             )
         table = self.folder / DECISIONS
         if table.exists():
-            rows = files.read_rows(table, "the decisions of a contest", CELLS)
-            self.rows = [Decision(*(row[name] for name in Decision._fields)) for row in rows]
+            self.rows = read_decisions(table)
 
     @property
     def told_measure(self) -> str:
@@ -369,12 +350,11 @@ class Contest:
         new = [each for each in alive if each.run not in known]
         diverged = self._train(new)
         for each in new:
-            values = np.full(1, np.nan) if each.run in diverged else self._measure(each)
-            found = bootstrap([values], mean)
+            values = np.zeros(0) if each.run in diverged else self._measure(each)
             spent = self.spent + more
             known[each.run] = Decision(
                 number, rung, each.run, each.stage, each.source, each.trained, spent,
-                found.estimate, found.low, found.high, -1,
+                *estimate(values),
             )  # fmt: skip
             self._write([*self.rows, known[each.run]])
         return [known[each.run].value for each in alive]
@@ -418,12 +398,9 @@ class Contest:
         """Judge a source as it is, for comparison; recorded data do not act."""
         if source.data is not None or any((r.round, r.source) == (0, word) for r in self.rows):
             return
-        from twirl_mjx.evaluation.rollout import evaluate_policy
-
-        env = make_env(self.target.evaluation, num_envs=self.rules.episodes)
-        values = evaluate_policy(env, source.policy)(self._key)[self.rules.measure]
-        found = bootstrap([values], mean)
-        row = Decision(0, 0, "", "", word, 0, 0, found.estimate, found.low, found.high, -1)
+        found = pipeline.evaluate_source(self.target, source, self.rules.episodes, self._key)
+        values = found[self.rules.measure]
+        row = Decision(0, 0, "", "", word, 0, 0, *estimate(values))
         self._write([*self.rows, row])
         self.say(f"{word} as it is: {self.rules.measure} {shown(row)}")
 
@@ -442,30 +419,7 @@ class Contest:
 
     def _write(self, rows: list[Decision]) -> None:
         self.rows = rows
-        table = [Decision._fields, *([_cell(value) for value in row] for row in rows)]
-        files.write_csv(self.folder / DECISIONS, table, f"# measure: {self.rules.measure}\n")
-
-
-def _cell(value: object) -> object:
-    return f"{value:.9g}" if isinstance(value, float) else value
-
-
-def shown(row: Decision) -> str:
-    """Return the value of a decision with its interval, as text."""
-    from twirl_mjx.figures.statistics import Interval
-    from twirl_mjx.figures.wording import interval_text
-
-    return interval_text(Interval(row.value, row.low, row.high, "episodes"))
-
-
-def ancestry(rows: Sequence[Decision], run: str) -> list[Decision]:
-    """Return the last decision on every run that leads to ``run``, oldest first."""
-    last = {row.run: row for row in rows if row.run}
-    line: list[Decision] = []
-    while run in last:
-        line.append(last[run])
-        run = last[run].source
-    return line[::-1]
+        write_decisions(self.folder / DECISIONS, rows, self.rules.measure)
 
 
 def slug(given: str) -> str:

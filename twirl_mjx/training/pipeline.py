@@ -15,6 +15,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import jax
+import numpy as np
 
 from twirl_mjx import exits, files
 from twirl_mjx.checks import check_once, choose_one
@@ -365,7 +366,7 @@ def _find_sources(
     sources = []
     for rule, member in zip(rules, members, strict=True):
         config = member.config
-        name = _place_of(rule, config, preset, runs_dir)
+        name = place_of(rule, config, preset, runs_dir)
         noise = config.uses_source_data and config.replay.source_noise
         if (name, noise) not in found:
             if isinstance(rule, source_rules.AtPath) and rule.is_shipped:
@@ -378,7 +379,7 @@ def _find_sources(
     return sources
 
 
-def _place_of(rule: source_rules.Rule, config: TrainConfig, preset: str, runs_dir: Path) -> str:
+def place_of(rule: source_rules.Rule, config: TrainConfig, preset: str, runs_dir: Path) -> str:
     """Return what ``resolve_policy`` calls the source of a run.
 
     Raises:
@@ -432,11 +433,20 @@ def _nominal_dir(config: TrainConfig, preset: str, runs_dir: Path) -> RunDir:
 
 def zero_shot(config: TrainConfig, run_dir: RunDir, source: Source, say: Say) -> None:
     """Evaluate the source policy in the target task without training it."""
-    from twirl_mjx.evaluation.rollout import evaluate_policy
     from twirl_mjx.tasks.measures import episode_means
 
     run_dir.open(config, source.identity)
-    env = make_env(config.evaluation, num_envs=config.eval.final_episodes)
-    values = evaluate_policy(env, source.policy)(jax.random.key(config.eval.seed + 1))
+    key = jax.random.key(config.eval.seed + 1)
+    values = evaluate_source(config, source, config.eval.final_episodes, key)
     run_dir.write_episodes(config, 0, values)
     say(f"zero-shot: {describe(episode_means(values))}")
+
+
+def evaluate_source(
+    config: TrainConfig, source: Source, episodes: int, key: jax.Array
+) -> dict[str, np.ndarray]:
+    """Return every measure of a source that acts, [episodes], in the worlds a run evaluates in."""
+    from twirl_mjx.evaluation.rollout import evaluate_policy
+
+    env = make_env(config.evaluation, num_envs=episodes)
+    return evaluate_policy(env, source.policy)(key)
