@@ -6,7 +6,7 @@ TWIRL := .venv/bin/twirl
 PYTEST := .venv/bin/pytest
 
 # What these are given is data, of which neither make nor the shell runs a word. ARGS is shell.
-GIVEN := TASK SHIFT SEED RUN GRID MINUTES EXAMPLES WHEELS PYTHON ACCEL
+GIVEN := TASK SHIFT SEED RUN GRID SOURCES MINUTES EXAMPLES WHEELS PYTHON ACCEL
 $(foreach name,$(GIVEN),$(if $(value $(name)),$(eval override $(name) := $$(value $(name)))))
 define NEWLINE
 
@@ -110,8 +110,9 @@ web: setup ## build a page that simulates in the browser into build/web (needs n
 bench: bench-setup ## measure this machine, beside SBX
 	$(TWIRL) bench $(ARGS)
 
-curriculum: setup ## train the chain of TASK= with SEED= (ARGS="--shifts": without the shifts)
-	$(TWIRL) curriculum $(call option,task,TASK) $(call option,seed,SEED) $(ARGS)
+curriculum: setup ## train the chain of TASK= with SEED=; SOURCES="a b": let these compete instead
+	$(TWIRL) curriculum $(call option,task,TASK) $(call option,seed,SEED) \
+	  $(if $(SOURCES),--sources $(foreach each,$(SOURCES),$(call quoted,$(each)))) $(ARGS)
 
 docs: ## build the pages and the API reference into build/site
 	@.ci/setup docs

@@ -3,9 +3,9 @@
 A *candidate* is a source with a *stage*: the target task itself, or an easier one of its family
 (another reward, say; ``Task.chain``). Every candidate gets a short TWiRL run, all of one *rung* as
 long; they are judged in the target task, the better half is trained on, and so forth until one is
-left: the winner of the *round*. In the next round it competes with the runs that it is the source
-of. A rung spends as many transitions as any other of its round, however many candidates there are
-(successive halving: Jamieson and Talwalkar, AISTATS 2016).
+left: the winner of the *round*. It is the source of all candidates of the next round. A rung spends
+as many transitions as any other of its round, however many candidates there are (successive
+halving: Jamieson and Talwalkar, AISTATS 2016).
 
 Everything is a run like any other, in the folder of runs, and a contest that was stopped goes on
 where it was. What was decided, and why, stands in ``decisions.csv``.
@@ -124,7 +124,7 @@ class Candidate(NamedTuple):
     config: TrainConfig
     """The run, with whatever budget."""
     trained: int = 0
-    """Transitions it has had before this round."""
+    """Transitions it has had."""
 
 
 def stages_of(task: str) -> tuple[Link, ...]:
@@ -197,8 +197,10 @@ class Contest:
         self.rows: list[Decision] = []
         self._resume()
         self.entrants = {word: self._entrant(given) for word, given in rules.sources}
+        judged = {row.run for row in self.rows}
         for candidate in self.first():
-            pipeline.check_early(candidate.config, rules.preset, RunDir(runs / candidate.run))
+            if candidate.run not in judged:
+                pipeline.check_early(candidate.config, rules.preset, RunDir(runs / candidate.run))
         self._judge = program.compile_evaluation(self.target, 1, rules.episodes)
         # Neither the seed of evaluations in training nor that of closing ones: it serves choices.
         self._key = jax.random.key(self.target.eval.seed + 2)
@@ -281,19 +283,29 @@ class Contest:
         ]
 
     def following(self, number: int, winner: Candidate) -> list[Candidate]:
-        """Return the candidates of a later round: the winner trained on, and as a source."""
+        """Return the candidates of a later round: the winner as the source of every stage.
+
+        It is a source of its own stage once more, with the settings it has learned with so far. As
+        a source it is not touched again.
+        """
         folder = str(self.runs / winner.run)
+        named = [
+            (stage.name, stage.name, candidate_config(self.rules, stage, folder))
+            for stage in stages_of(self.rules.task)
+        ]
+        on = dataclasses.replace(
+            winner.config,
+            variant="twirl+weights",
+            source=folder,
+            source_contract="",
+            source_command="",
+            allow_clipping=False,
+        )
+        if all(on != config for _, _, config in named):
+            named.append((f"{winner.stage}-on", winner.stage, on))
         return [
-            winner,
-            *(
-                Candidate(
-                    f"{self.name}-{number}-{stage.name}",
-                    stage.name,
-                    winner.run,
-                    candidate_config(self.rules, stage, folder),
-                )
-                for stage in stages_of(self.rules.task)
-            ),
+            Candidate(f"{self.name}-{number}-{name}", stage, winner.run, config)
+            for name, stage, config in named
         ]
 
     def hold(self) -> Candidate:
@@ -390,8 +402,11 @@ class Contest:
         return diverged
 
     def _measure(self, candidate: Candidate) -> np.ndarray:
-        """Return the measure of the run's policy in the target task, an episode each."""
-        actor = actor_of(RunDir(self.runs / candidate.run))
+        """Return the measure of the run's last policy in the target task, an episode each.
+
+        The best one would often be the source's own, with which runs that take over networks begin.
+        """
+        actor = actor_of(RunDir(self.runs / candidate.run).last_policy)
         return self._judge(actor, self._key)[0][self.rules.measure]
 
     def _judge_source(self, word: str, source: Source) -> None:

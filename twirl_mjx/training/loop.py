@@ -10,6 +10,7 @@ import math
 import threading
 import time
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -376,13 +377,13 @@ def train(
 def final_evaluation(runs: Sequence[Run]) -> list[dict[str, np.ndarray]]:
     """Evaluate the best policy of every run on fresh seeds; return measures [E] of each."""
     config = runs[0].config
-    actors = [actor_of(run.run_dir) for run in runs]
+    actors = [actor_of(run.run_dir.policy) for run in runs]
     evaluate = program.compile_evaluation(config, len(runs), config.eval.final_episodes)
     return evaluate(program.join(actors), jax.random.key(config.eval.seed + 1))
 
 
-def actor_of(run_dir: RunDir) -> Any:
-    """Return the parameters of the best policy of a run."""
-    policy = load_policy(run_dir.policy)
+def actor_of(path: Path) -> Any:
+    """Return the parameters of a policy of a run."""
+    policy = load_policy(path)
     assert isinstance(policy, NumpyPolicy), "a run writes .npz policies"
     return jax.tree.map(jnp.asarray, dict(policy.actor_params))
