@@ -94,7 +94,7 @@ def test_a_winner_is_the_source_of_the_next_round_and_the_line_of_descent_is_tol
     assert line == ["c-1-walk-from-zero", "c-2-biped", "c-3-walk"]
     text = told.summary(winner)
     assert "chain: zero -> walk (c-1-walk-from-zero) -> biped (c-2-biped) -> walk (c-3" in text
-    assert "better before: c-2-biped, 9.00" in text
+    assert "better before: c-2-biped, 9.0 " in text
 
 
 def test_what_was_better_before_is_told(tmp_path: Path) -> None:
