@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -205,8 +206,12 @@ def test_the_tree_has_a_line_for_every_run_and_a_cross_where_one_was_dropped(
     pairs = [(source, stage) for source in ("zero", "trot") for stage in ("walk", "biped")]
     assert labels == [
         *(f"1: {stage} from {source}" for source, stage in pairs),
-        "2: walk", "2: biped", "2: walk", "3: walk", "3: biped",
+        "2: walk", "2: biped", "2: walk, as before", "3: walk", "3: biped",
     ]  # fmt: skip
+    figure.draw_without_rendering()
+    boxes = [text.get_window_extent() for text in axes.get_yticklabels()]
+    heights = sorted((box.y0, box.y1) for box in boxes)
+    assert all(below[1] <= above[0] for below, above in itertools.pairwise(heights)), "overlap"
     crosses = [line for line in axes.lines if line.get_marker() == "x"]
     assert len(crosses) == sum(row.kept == DROPPED for row in told.rows) == 6
     with pytest.raises(ValueError, match="no candidate"):

@@ -14,6 +14,8 @@ from twirl_mjx.figures.wording import interval_text
 
 GOES_ON, DROPPED, OPEN = 1, 0, -1
 """What can become of a candidate: OPEN until its rung is whole."""
+ON = "-on"
+"""How the run of a candidate ends that learns with the settings of its source."""
 
 
 class Decision(NamedTuple):

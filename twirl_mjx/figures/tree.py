@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from twirl_mjx.figures.canvas import canvas, steps_axis
-from twirl_mjx.figures.decisions import DROPPED, GOES_ON, Decision, ancestry
+from twirl_mjx.figures.decisions import DROPPED, GOES_ON, ON, Decision, ancestry
 from twirl_mjx.figures.tables import ARM_COLUMN, Table
 from twirl_mjx.figures.wording import numbers
 
@@ -38,8 +38,8 @@ def contest_tree(
     places = {run: -index for index, run in enumerate(runs)}
     line = {row.run for row in ancestry(rows, _winner(judged))}
     starts = {run: _start(judged, run) for run in runs}
-    with canvas(title, Table({ARM_COLUMN: np.array([])}), theme, (1, 1), (8.2, 1.0)) as frame:
-        frame.figure.set_figheight(1.0 + _ROW * len(runs))
+    size = (8.2, 0.6 + _ROW * len(runs))
+    with canvas(title, Table({ARM_COLUMN: np.array([])}), theme, (1, 1), size) as frame:
         axes, colours = frame.axes[0, 0], frame.theme
         for run in runs:
             mine = [row for row in judged if row.run == run]
@@ -92,4 +92,5 @@ def _label(judged: Sequence[Decision], run: str) -> str:
     """Return "walk from stand", and the round alone for a run from an earlier one."""
     row = next(row for row in judged if row.run == run)
     known = any(other.run == row.source for other in judged)
-    return f"{row.round}: {row.stage}" + ("" if known else f" from {row.source}")
+    stage = f"{row.stage}, as before" if run.endswith(ON) else row.stage
+    return f"{row.round}: {stage}" + ("" if known else f" from {row.source}")

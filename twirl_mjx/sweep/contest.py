@@ -28,6 +28,7 @@ import numpy as np
 from twirl_mjx import files
 from twirl_mjx.checks import check_choice, check_once, check_range
 from twirl_mjx.figures.decisions import (
+    ON,
     Decision,
     ancestry,
     estimate,
@@ -302,7 +303,7 @@ class Contest:
             allow_clipping=False,
         )
         if all(on != config for _, _, config in named):
-            named.append((f"{winner.stage}-on", winner.stage, on))
+            named.append((f"{winner.stage}{ON}", winner.stage, on))
         return [
             Candidate(f"{self.name}-{number}-{name}", stage, winner.run, config)
             for name, stage, config in named
