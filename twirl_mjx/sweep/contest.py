@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import itertools
 import math
 import re
 from collections.abc import Callable, Sequence
@@ -46,7 +45,7 @@ from twirl_mjx.training.config import TrainConfig, of_program
 from twirl_mjx.training.guards import DivergedError
 from twirl_mjx.training.loop import actor_of
 from twirl_mjx.training.presets import make_config
-from twirl_mjx.training.rundir import RunDir, check_name
+from twirl_mjx.training.rundir import RunDir, check_name, digest
 from twirl_mjx.training.weights import source_weights
 
 Say = Callable[[str], None]
@@ -93,8 +92,8 @@ class Rules:
         check_once("--sources", [name for name, _ in self.sources])
         for name, _ in self.sources:
             check_name(name)
-        kind = TASKS.get(TASKS.admit(self.task))
         object.__setattr__(self, "task", TASKS.admit(self.task))
+        kind = TASKS.get(self.task)
         if not self.measure:
             object.__setattr__(self, "measure", kind.aim or kind.lead[0])
         check_choice("measure", self.measure, (*measures_of(kind), "success"))
@@ -380,9 +379,10 @@ class Contest:
         ]
         diverged: set[str] = set()
         rules = self.rules
-        alike = lambda each: repr(of_program(each.config))  # noqa: E731
-        for _, group in itertools.groupby(sorted(budgets, key=alike), key=alike):
-            together = list(group)
+        programs: dict[str, list[Candidate]] = {}
+        for each in budgets:
+            programs.setdefault(digest(of_program(each.config)), []).append(each)
+        for together in programs.values():
             try:
                 pipeline.run_together(
                     [each.config for each in together],
