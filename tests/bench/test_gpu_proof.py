@@ -60,12 +60,17 @@ def fake(monkeypatch: pytest.MonkeyPatch) -> type[FakeWorker]:
     return FakeWorker
 
 
+def timed(options: GpuProofBench, folder: Folder) -> list[dict[str, Any]]:
+    with gpu_proof.compiling(options, folder) as workers:
+        return gpu_proof.time_variants(options, folder, workers, 1e9)["rows"]
+
+
 def test_a_failed_variant_is_a_row_and_is_tried_again(
     tmp_path: Path, fake: type[FakeWorker]
 ) -> None:
     options, folder = GpuProofBench(tiny=True), Folder(tmp_path / "new")
     fake.broken.add("learner plain")
-    first = gpu_proof.time_variants(options, folder, 1e9)["rows"]
+    first = timed(options, folder)
     assert [bool(row["fault"]) for row in first] == [True, False, False]
     assert first[1]["rate"] == 100.0
     assert first[1]["spread"] == pytest.approx(0.2)
@@ -73,7 +78,7 @@ def test_a_failed_variant_is_a_row_and_is_tried_again(
 
     fake.broken.clear()
     fake.started.clear()
-    second = gpu_proof.time_variants(options, folder, 1e9)["rows"]
+    second = timed(options, folder)
     assert fake.started == ["learner plain"]
     assert sorted(row["name"] for row in second) == sorted(row["name"] for row in first)
     assert not any(row["fault"] for row in second)
@@ -89,7 +94,7 @@ def test_a_full_disk_is_said_once_and_loses_no_result(
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(files, "write_csv", full)
-    rows = gpu_proof.time_variants(GpuProofBench(tiny=True), Folder(tmp_path), 1e9)["rows"]
+    rows = timed(GpuProofBench(tiny=True), Folder(tmp_path))
     assert len(rows) == 3
     assert capsys.readouterr().err.count("No space left") == 1
 
@@ -120,7 +125,7 @@ def test_table_shows_what_a_folder_holds(tmp_path: Path) -> None:
     errors = {"learner.fast.actor": 1e-4, "learner.fast.critic": 2e-3, "native.qpos": 1e-6}
     parity = [{"name": n, "error": e, "tolerance": 1e-3} for n, e in errors.items()]
     folder.write(gpu_proof.PARITY, parity)
-    seed = {"seed": 0, "env_steps": 6400, "grad_steps": 3200, "wall_s": 61.0}
+    seed = {"run": "a-s0", "env_steps": 6400, "grad_steps": 3200, "wall_s": 61.0}
     folder.write(gpu_proof.TRAINING, [seed | {"updates_per_s": 812.5, "eval_return": 31.0}])
     gpu_table.measure(options)
     text = page.read_text()
@@ -130,7 +135,7 @@ def test_table_shows_what_a_folder_holds(tmp_path: Path) -> None:
     assert "| mjx, worlds 8 | - | u | - | status 1 |" in text
     assert "| learner.fast | critic | 2.0e-03 | 1e-03 | no |" in text
     assert "| native | qpos | 1.0e-06 | 1e-03 | yes |" in text
-    assert "| 0 | 6,400 | 3,200 | 61 | 812 | 31 |" in text
+    assert "| a-s0 | 6,400 | 3,200 | 61 | 812 | 31 |" in text
 
 
 @pytest.mark.slow
@@ -149,7 +154,7 @@ def test_proof_from_the_shell_on_a_cpu_and_again(tmp_path: Path) -> None:
     assert len(first["gpu-timings"]["rows"]) == 3
     assert not any(row["fault"] for row in first["gpu-timings"]["rows"])
     assert all(row["error"] <= row["tolerance"] for row in first["gpu-parity"]["rows"])
-    assert [row["seed"] for row in first["gpu-training"]["rows"]] == [0, 1]
+    assert len(first["gpu-training"]["rows"]) == 2
     assert {row["env_steps"] for row in first["gpu-training"]["rows"]} == {96}
     assert second["gpu-timings"] == first["gpu-timings"]
     assert "compiling 0 variants, 3 are measured" in told

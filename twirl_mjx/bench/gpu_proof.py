@@ -7,6 +7,7 @@ call goes on from them: measured rows are not measured again, and the training r
 
 from __future__ import annotations
 
+import concurrent.futures
 import contextlib
 import dataclasses
 import json
@@ -16,11 +17,11 @@ import statistics
 import subprocess
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from twirl_mjx import files
+from twirl_mjx import array_files, files
 from twirl_mjx.bench import parity
 from twirl_mjx.bench.measure import Record, progress, summary
 from twirl_mjx.bench.options import GpuProofBench
@@ -28,11 +29,13 @@ from twirl_mjx.bench.worker import Worker
 
 PARITY, TIMINGS, TRAINING, MACHINE = "parity.csv", "timings.csv", "training.csv", "machine.json"
 """What a proof leaves in its folder, beside the runs of the training."""
+REFERENCE = "reference.npz"
+"""The numbers of a CPU; those of an earlier call, or brought from another machine, are used."""
 COLUMNS: dict[str, dict[str, type]] = {
     PARITY: {"name": str, "error": float, "tolerance": float},
     TIMINGS: {"name": str, "unit": str, "rate": float, "spread": float, "ready_s": float}
     | {"fault": str},
-    TRAINING: {"seed": int, "env_steps": int, "grad_steps": int, "wall_s": float}
+    TRAINING: {"run": str, "env_steps": int, "grad_steps": int, "wall_s": float}
     | {"updates_per_s": float, "eval_return": float},
 }
 """Table -> its columns."""
@@ -164,17 +167,23 @@ def prove_parity(options: GpuProofBench, folder: Folder, deadline: float) -> Rec
     if rows:
         return {"rows": rows}
     progress("bench gpu-proof: parity with the CPU")
+    engines = parity.ENGINES[:1] if options.tiny else parity.ENGINES
+    left = max(1.0, deadline - time.monotonic())
+
+    def numbers(name: str, platform: Mapping[str, str]) -> parity.Numbers:
+        if name == REFERENCE and (folder.path / name).exists():
+            return array_files.read_npz(folder.path / name, "numbers of parity")
+        return parity.write(folder.path / name, {**environment(), **platform}, left, engines)
+
     try:
         files.make_folders(folder.path)
-        found = []
-        for name, platform in (("reference.npz", {"JAX_PLATFORMS": "cpu"}), ("numbers.npz", {})):
-            left = max(1.0, deadline - time.monotonic())
-            given = {**environment(), **platform}
-            engines = parity.ENGINES[:1] if options.tiny else parity.ENGINES
-            found.append(parity.write(folder.path / name, given, left, engines))
+        with concurrent.futures.ThreadPoolExecutor() as pool:
+            found = list(
+                pool.map(numbers, (REFERENCE, "numbers.npz"), ({"JAX_PLATFORMS": "cpu"}, {}))
+            )
     except subprocess.TimeoutExpired as late:
         return {"error": f"parity was not done in {late.timeout:.0f} s (--minutes)"}
-    except (OSError, RuntimeError) as error:
+    except (OSError, RuntimeError, ValueError) as error:
         return {"error": f"parity: {error}"}
     rows = [
         {"name": name, "error": error, "tolerance": parity.TOLERANCE[name.split(".")[0]]}
@@ -184,35 +193,46 @@ def prove_parity(options: GpuProofBench, folder: Folder, deadline: float) -> Rec
     return {"rows": rows}
 
 
-def time_variants(options: GpuProofBench, folder: Folder, deadline: float) -> Record:
-    """Compile all variants at once, then time each alone; what fails is a row with its reason."""
-    rows = [row for row in folder.read(TIMINGS) if not row["fault"]]
-    known = {row["name"] for row in rows}
+@contextlib.contextmanager
+def compiling(options: GpuProofBench, folder: Folder) -> Iterator[list[tuple[Variant, Worker]]]:
+    """Give the processes of all variants that were not measured yet; they compile at once."""
+    known = {row["name"] for row in folder.read(TIMINGS) if not row["fault"]}
     missing = [variant for variant in variants(options) if variant.name not in known]
     progress(f"bench gpu-proof: compiling {len(missing)} variants, {len(known)} are measured")
-    began = time.monotonic()
     with contextlib.ExitStack() as stack:
-        ready: list[tuple[Variant, Worker, float]] = []
-        waiting = []
+        workers = []
         for variant in missing:
             given = {**environment(), **variant.environment}
             worker = Worker(variant.kind, dict(variant.options), environment=given)
-            waiting.append((variant, stack.enter_context(worker)))
-        for variant, worker in waiting:
-            try:
-                worker.wait_until_ready(max(1.0, deadline - time.monotonic()))
-                ready.append((variant, worker, time.monotonic() - began))
-            except RuntimeError as error:
-                rows.append(_row(variant, fault=str(error)))
-        for variant, worker, ready_s in ready:
-            progress(f"bench gpu-proof: {variant.name}")
-            try:
-                worker.start(options.seconds)
-                found = summary(worker.samples(10 * options.seconds + 60))
-                rows.append(_row(variant, found["median"], found["spread"], ready_s))
-            except (RuntimeError, OSError, ValueError) as error:
-                rows.append(_row(variant, fault=str(error)))
-            folder.write(TIMINGS, rows)
+            workers.append((variant, stack.enter_context(worker)))
+        yield workers
+
+
+def time_variants(
+    options: GpuProofBench,
+    folder: Folder,
+    workers: Sequence[tuple[Variant, Worker]],
+    deadline: float,
+) -> Record:
+    """Wait until all variants are compiled, then time each alone; a failed one is a row."""
+    rows = [row for row in folder.read(TIMINGS) if not row["fault"]]
+    began = time.monotonic()
+    ready: list[tuple[Variant, Worker, float]] = []
+    for variant, worker in workers:
+        try:
+            worker.wait_until_ready(max(1.0, deadline - time.monotonic()))
+            ready.append((variant, worker, time.monotonic() - began))
+        except RuntimeError as error:
+            rows.append(_row(variant, fault=str(error)))
+    for variant, worker, ready_s in ready:
+        progress(f"bench gpu-proof: {variant.name}")
+        try:
+            worker.start(options.seconds)
+            found = summary(worker.samples(10 * options.seconds + 60))
+            rows.append(_row(variant, found["median"], found["spread"], ready_s))
+        except (RuntimeError, OSError, ValueError) as error:
+            rows.append(_row(variant, fault=str(error)))
+        folder.write(TIMINGS, rows)
     folder.write(TIMINGS, rows)
     return {"rows": rows}
 
@@ -232,9 +252,18 @@ def _row(
 
 def train(options: GpuProofBench, folder: Folder, deadline: float) -> Record:
     """Train all seeds in one program until the deadline; the same call resumes them."""
+    runs, status = folder.path / "runs", None
+    if options.seeds:
+        status = _train_until(options, runs, deadline)
+    rows = _progress_of(runs)
+    folder.write(TRAINING, rows)
+    return {"rows": rows, "status": status, "task": options.task, "preset": options.preset}
+
+
+def _train_until(options: GpuProofBench, runs: Path, deadline: float) -> int:
+    """Return the exit status of a training that was given the time that is left."""
     left = deadline - time.monotonic()
     minutes = (left - SAVING_S) / 60.0 if left > 2 * SAVING_S else left / 120.0
-    runs = folder.path / "runs"
     words = ["--task", options.task, "--preset", options.preset, "--runs", str(runs)]
     words += ["--seeds", *map(str, range(options.seeds)), "--minutes", f"{max(minutes, 0.01):.2f}"]
     progress(f"bench gpu-proof: training {options.seeds} seeds for {minutes:.1f} min")
@@ -244,24 +273,21 @@ def train(options: GpuProofBench, folder: Folder, deadline: float) -> Record:
         env={**os.environ, **environment()},
     )
     try:
-        status = process.wait(timeout=max(1.0, left))
+        return process.wait(timeout=max(1.0, left))
     except subprocess.TimeoutExpired:
         process.send_signal(signal.SIGTERM)  # it saves and stops
-        try:
-            status = process.wait(timeout=SAVING_S)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            status = process.wait()
-    rows = [row for seed in range(options.seeds) for row in _progress_of(runs, seed)]
-    folder.write(TRAINING, rows)
-    record: Record = {"rows": rows, "status": status, "task": options.task}
-    return record | {"preset": options.preset}
+    try:
+        return process.wait(timeout=SAVING_S)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        return process.wait()
 
 
-def _progress_of(runs: Path, seed: int) -> list[Record]:
-    """Return how far the run of a seed is, or nothing; the run of its source is another task's."""
+def _progress_of(runs: Path) -> list[Record]:
+    """Return how far every run of a folder is, that of a source too."""
     columns = {"metric": str, "env_steps": int, "grad_steps": int, "wall_s": float, "value": float}
-    for path in sorted(runs.glob(f"*-s{seed}/metrics.csv")):
+    found = []
+    for path in sorted(runs.glob("*/metrics.csv")):
         rows = files.read_rows(path, "the metrics of a run", columns, growing=True)
         by_name: dict[str, list[Record]] = {}
         for row in rows:
@@ -271,17 +297,17 @@ def _progress_of(runs: Path, seed: int) -> list[Record]:
         last = max((each[-1] for each in by_name.values()), key=lambda row: row["env_steps"])
         rates = [row["value"] for row in by_name.get("updates_per_s", []) if row["value"] > 0]
         returns = [row["value"] for row in by_name.get("eval/return", [])]
-        return [
+        found.append(
             {
-                "seed": seed,
+                "run": path.parent.name,
                 "env_steps": last["env_steps"],
                 "grad_steps": last["grad_steps"],
                 "wall_s": last["wall_s"],
                 "updates_per_s": statistics.median(rates) if rates else 0.0,
                 "eval_return": returns[-1] if returns else float("nan"),
             }
-        ]
-    return []
+        )
+    return found
 
 
 def measure(options: GpuProofBench) -> Record:
@@ -291,7 +317,9 @@ def measure(options: GpuProofBench) -> Record:
     folder = Folder(options.out)
     machine = find_machine(whole / 4)
     folder.write_machine(machine)
-    parts = {"gpu-parity": prove_parity(options, folder, began + 0.3 * whole)}
-    parts["gpu-timings"] = time_variants(options, folder, began + 0.5 * whole)
+    parts = {}
+    with compiling(options, folder) as workers:
+        parts["gpu-parity"] = prove_parity(options, folder, began + 0.4 * whole)
+        parts["gpu-timings"] = time_variants(options, folder, workers, began + 0.5 * whole)
     parts["gpu-training"] = train(options, folder, began + whole)
     return {"part": "gpu-proof", "parts": parts, "machine": machine}

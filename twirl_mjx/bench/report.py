@@ -223,10 +223,10 @@ def gpu_timings_sheet(record: Record) -> Sheet:
 
 
 def gpu_training_sheet(record: Record) -> Sheet:
-    """Lay out how far every seed came."""
+    """Lay out how far every run came."""
     rows = tuple(
         (
-            str(row["seed"]),
+            row["run"],
             f"{row['env_steps']:,}",
             f"{row['grad_steps']:,}",
             f"{row['wall_s']:.0f}",
@@ -235,7 +235,7 @@ def gpu_training_sheet(record: Record) -> Sheet:
         )
         for row in record["rows"]
     )
-    columns = ("seed", "transitions", "critic updates", "s", "updates/s", "return")
+    columns = ("run", "transitions", "critic updates", "s", "updates/s", "return")
     return Sheet("Training", columns, rows)
 
 
