@@ -218,6 +218,31 @@ def test_the_backend_chooses_the_form(monkeypatch):
         DroqConfig(form="gpu")
 
 
+@pytest.mark.parametrize(
+    ("capabilities", "settings", "form"),
+    [
+        (["9.0"], {}, "kernels"),
+        (["12.0"], {"batch_size": 512}, "kernels"),
+        (["7.5"], {}, "accelerator"),
+        (["gfx90a"], {}, "accelerator"),
+        ([None], {}, "accelerator"),
+        (["9.0", "9.0"], {}, "accelerator"),
+        (["9.0"], {"batch_size": 1024}, "accelerator"),
+        (["9.0"], {"batch_size": 250}, "accelerator"),
+        (["9.0"], {"hidden_sizes": (256, 200)}, "accelerator"),
+    ],
+)
+def test_kernels_are_chosen_where_they_were_timed(monkeypatch, capabilities, settings, form):
+    class Device:
+        def __init__(self, capability):
+            if capability:
+                self.compute_capability = capability
+
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    monkeypatch.setattr(jax, "devices", lambda: [Device(c) for c in capabilities])
+    assert forms.name_of(DroqConfig(**settings)) == form
+
+
 @pytest.mark.slow
 def test_bfloat16_products_stay_close_and_parameters_stay_float32(transitions):
     config = DroqConfig(hidden_sizes=(32, 16), batch_size=8, matmul_dtype="bfloat16")

@@ -43,8 +43,8 @@ class DroqConfig:
     fast: bool = True
     """Use the fast form of the update; False is the plain flax/optax form of the same maths."""
     form: Literal["auto", "fast", "accelerator", "kernels"] = "auto"
-    """Which fast form: fast is laid out for CPUs, accelerator for GPUs and TPUs, auto for what is
-    used; kernels are hand-written ones for GPUs that have not run on any yet."""
+    """Which fast form: fast is laid out for CPUs, accelerator for GPUs and TPUs, kernels are for
+    NVIDIA GPUs (sizes in powers of two); auto is the fastest for what is used."""
 
     def __post_init__(self) -> None:
         """Check every number.
@@ -70,24 +70,23 @@ class DroqConfig:
             raise ValueError(
                 f"droq.hidden_sizes = {self.hidden_sizes} needs sizes >= 1 (nearest: {nearest})"
             )
-        if self.form == "kernels":
-            self._check_kernels()
+        if self.form == "kernels" and (reason := self.kernels_refuse()):
+            raise ValueError(f"droq.form kernels needs {reason}")
 
-    def _check_kernels(self) -> None:
-        """Refuse sizes that hand-written kernels cannot cut into blocks, or raise ValueError."""
+    def kernels_refuse(self) -> str | None:
+        """Return which size hand-written kernels cannot cut into blocks, or None."""
         for size in self.hidden_sizes:
             if size < 16 or size & (size - 1):
                 nearest = max(16, 1 << round(math.log2(size)))
-                raise ValueError(
-                    f"droq.form kernels needs hidden sizes that are powers of two from 16, not"
-                    f" {size} (nearest: {nearest})"
+                return (
+                    f"hidden sizes that are powers of two from 16, not {size} (nearest: {nearest})"
                 )
         if self.batch_size % 16:
             nearest = max(16, round(self.batch_size / 16) * 16)
-            raise ValueError(
-                f"droq.form kernels needs a batch size that is a multiple of 16, not"
-                f" {self.batch_size} (nearest: {nearest})"
+            return (
+                f"a batch size that is a multiple of 16, not {self.batch_size} (nearest: {nearest})"
             )
+        return None
 
 
 def settings_of(form: str) -> dict[str, Any]:

@@ -15,8 +15,9 @@ Minibatches stay stacked; a kernel is told which update it is. The masks are tho
 ``accelerator``, so the two forms are equal up to the order of sums, and the sums are in a fixed
 order: nothing is added atomically. Actor and temperature use ``accelerator``.
 
-No GPU has run this yet. It compiles for one (``bench gpu-compile``); on a CPU Pallas interprets it,
-which is right and far too slow to train with. It must be asked for (``--droq.form kernels``).
+On an H200 it agrees with the CPU to the same digits as the other forms do, and one learner makes
+2.2 times the updates of ``accelerator`` (docs/accelerators.md), so ``forms`` chooses it there. On a
+CPU Pallas interprets it, which is right and far too slow to train with.
 """
 
 from __future__ import annotations
