@@ -167,6 +167,39 @@ def test_when_none_is_whole_nothing_is_deleted(
     assert sorted(run_dir.rglob("*")) == before
 
 
+def test_a_replay_that_was_left_behind_is_gathered_anew_when_asked(
+    saved: Path, fresh: TrainState, tmp_path: Path
+) -> None:
+    run_dir = tmp_path / "run"
+    shutil.copytree(saved, run_dir)
+    shutil.rmtree(run_dir / "checkpoints" / "replay")
+    before = sorted(run_dir.rglob("*.json"))
+    with pytest.raises(DamagedError, match=r"replay of .*run was left behind.*--refill"):
+        restore(run_dir, fresh)
+    assert sorted(run_dir.rglob("*.json")) == before
+    asked = []
+
+    def refill(state: TrainState) -> jax.Array:
+        asked.append((int(state.env_steps), state.replay.online.rows.size))
+        return after(fresh, 160).replay.online.rows
+
+    checkpoints = Checkpoints(run_dir)
+    found, _ = checkpoints.restore(jax.eval_shape(lambda: fresh), refill)
+    assert asked == [(160, 0)]
+    assert checkpoints.refilled and not checkpoints.stepped_over
+    np.testing.assert_array_equal(found.replay.online.rows, after(fresh, 160).replay.online.rows)
+    checkpoints.save(after(fresh, 192), {"inserted": 192, "best": 0.5})
+    checkpoints.close()
+    assert restore(run_dir, fresh) == (192, None)  # whole again, rows and all
+
+
+def test_refill_is_not_asked_for_rows_that_are_there(saved: Path, fresh: TrainState) -> None:
+    checkpoints = Checkpoints(saved)
+    found, _ = checkpoints.restore(jax.eval_shape(lambda: fresh), lambda _: pytest.fail("asked"))
+    checkpoints.close()
+    assert int(found.env_steps) == 160 and not checkpoints.refilled
+
+
 def test_a_row_between_checkpoints_that_none_needs_is_no_damage(
     saved: Path, fresh: TrainState, tmp_path: Path
 ) -> None:

@@ -121,6 +121,19 @@ def test_its_state_is_that_of_the_seed_alone(
 
 
 @pytest.mark.slow
+def test_a_batch_goes_on_without_the_replay_of_one(
+    stand_config: TrainConfig, short_stand_config: TrainConfig, template: TrainState, tmp_path: Path
+) -> None:
+    train(short_stand_config, tmp_path)
+    kept = np.asarray(stored(template, tmp_path / "b-s3").replay.online.rows)[:64]
+    shutil.rmtree(tmp_path / "b-s5" / "checkpoints" / "replay")
+    train(dataclasses.replace(stand_config, refill=True), tmp_path)
+    rows = [stored(template, tmp_path / name).replay.online.rows for name in ("b-s3", "b-s5")]
+    np.testing.assert_array_equal(np.asarray(rows[0])[:64], kept)
+    assert (np.abs(np.asarray(rows[1])[:96]).sum(axis=1) > 0).all()
+
+
+@pytest.mark.slow
 def test_a_batch_resumes_bit_for_bit(
     stand_config: TrainConfig,
     short_stand_config: TrainConfig,

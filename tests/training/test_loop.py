@@ -82,6 +82,35 @@ def test_resumed_run_equals_whole_run_bit_for_bit(
     assert_identical(a, b)
 
 
+def test_a_run_without_its_replay_goes_on_with_one_of_its_policy(
+    stand_config: TrainConfig,
+    short_stand_config: TrainConfig,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    run_dir = tmp_path / "light"
+    train(short_stand_config, run_dir)
+    before = np.asarray(final_state(short_stand_config, run_dir).replay.online.rows)
+    shutil.rmtree(run_dir / "checkpoints" / "replay")
+    with pytest.raises(ValueError, match="--refill"):
+        train(stand_config, run_dir)
+    assert train(dataclasses.replace(stand_config, refill=True), run_dir).env_steps == 96
+    assert "64 transitions were gathered anew" in " ".join(capsys.readouterr().out.split())
+    state = final_state(stand_config, run_dir)  # whole again: the rows are stored
+    online = state.replay.online
+    assert (int(online.size), int(online.insert_index), int(state.inserted)) == (96, 96, 96)
+    rows = np.asarray(online.rows)
+    assert np.isfinite(rows).all() and (np.abs(rows[:96]).sum(axis=1) > 0).all()
+    assert not np.array_equal(rows[:64], before[:64])
+    # Rows are of worlds that were stepped: the next observation of one opens the next of its world.
+    envs, obs = stand_config.num_envs, online.obs_size
+    follows = (rows[envs:64, :obs] == rows[: 64 - envs, -obs:]).all(axis=1)
+    assert follows.mean() > 0.5
+    assert int(state.learner.grad_steps) == 64
+    card = load_policy(run_dir / "policy_last.npz").header.card
+    assert card["replay_refilled_at"] == [64]
+
+
 @pytest.mark.slow
 def test_a_run_goes_on_from_the_checkpoint_before_a_damaged_one(
     stand_config: TrainConfig,

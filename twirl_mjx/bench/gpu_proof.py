@@ -251,7 +251,10 @@ def _row(
 
 
 def train(options: GpuProofBench, folder: Folder, deadline: float) -> Record:
-    """Train all seeds in one program until the deadline; the same call resumes them."""
+    """Train all seeds in one program until the deadline; the same call resumes them.
+
+    Their replay, nearly all of the folder, may be left behind: it is gathered anew (``--refill``).
+    """
     runs, status = folder.path / "runs", None
     if options.seeds:
         status = _train_until(options, runs, deadline)
@@ -264,7 +267,7 @@ def _train_until(options: GpuProofBench, runs: Path, deadline: float) -> int:
     """Return the exit status of a training that was given the time that is left."""
     left = deadline - time.monotonic()
     minutes = (left - SAVING_S) / 60.0 if left > 2 * SAVING_S else left / 120.0
-    words = ["--task", options.task, "--preset", options.preset, "--runs", str(runs)]
+    words = ["--task", options.task, "--preset", options.preset, "--runs", str(runs), "--refill"]
     words += ["--seeds", *map(str, range(options.seeds)), "--minutes", f"{max(minutes, 0.01):.2f}"]
     progress(f"bench gpu-proof: training {options.seeds} seeds for {minutes:.1f} min")
     process = subprocess.Popen(

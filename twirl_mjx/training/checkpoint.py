@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Iterator, Set
+from collections.abc import Callable, Iterator, Set
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +30,8 @@ from twirl_mjx.training import manifests
 from twirl_mjx.training.manifests import DamagedError
 from twirl_mjx.training.state import TrainState
 
+Refill = Callable[[TrainState], jax.Array]
+"""Gives the rows [C, W] of an online ring for a state that was stored without them."""
 KEEP = 2
 """Checkpoints kept, newest first; an interrupted write falls back on the one before."""
 
@@ -99,6 +101,8 @@ class Checkpoints:
         manifests.begin(self._root)
         self.stepped_over: str | None = None
         """What :meth:`restore` found damaged and where it went on from, as a line."""
+        self.refilled = False
+        """Whether :meth:`restore` found no row of the ring and had them gathered anew."""
         cut_short = set(manifests.stored(self._root)) - set(manifests.visible(self._root))
         for folder in (
             *self._root.glob("orbax/*.orbax-checkpoint-tmp*"),
@@ -161,11 +165,14 @@ class Checkpoints:
         rows = [path for _, end, path in _segments(self._replay) if end > begin]
         manifests.seal(self._root, step, total, rows)
 
-    def restore(self, template: TrainState) -> tuple[TrainState, dict[str, Any]]:
+    def restore(
+        self, template: TrainState, refill: Refill | None = None
+    ) -> tuple[TrainState, dict[str, Any]]:
         """Return the newest good checkpoint as a state shaped like ``template``, and its progress.
 
         Damaged ones are stepped over: ``stepped_over`` says so, and they are deleted, since the
-        run will write them again. The source ring is taken from ``template``.
+        run will write them again. The source ring is taken from ``template``. A run of which all
+        rows were left behind is damaged, too, unless there is ``refill``.
 
         Raises:
             FileNotFoundError: There is none.
@@ -176,10 +183,12 @@ class Checkpoints:
         if not steps:
             raise FileNotFoundError(f"no checkpoint in {self._root}")
         damage: list[str] = []
+        left_behind = not _segments(self._replay)
+        self.refilled = left_behind and refill is not None
         for step in reversed(steps):
             try:
-                manifests.check(self._root, step)
-                found = self._read(step, template)
+                manifests.check(self._root, step, rows=not self.refilled)
+                found = self._read(step, template, refill if self.refilled else None)
             except DamagedError as error:
                 damage.append(str(error))
                 continue
@@ -190,14 +199,21 @@ class Checkpoints:
                     f"{damage[0]}; going on from the checkpoint before it, at {step:,} transitions"
                 )
             return found
+        if left_behind:
+            raise DamagedError(
+                f"{self._replay} is empty: the replay of {self._run_dir} was left behind. Nothing"
+                " was touched (nearest: --refill, which gathers as much anew with its policy)"
+            )
         raise DamagedError(
             f"{damage[0]}; no checkpoint of {self._run_dir} is whole, so it cannot go on. Give"
             " another --name; its policy can start that run: --variant weights --source"
             f" {self._run_dir / BEST_POLICY}"
         )
 
-    def _read(self, step: int, template: TrainState) -> tuple[TrainState, dict[str, Any]]:
-        """Return one checkpoint."""
+    def _read(
+        self, step: int, template: TrainState, refill: Refill | None
+    ) -> tuple[TrainState, dict[str, Any]]:
+        """Return one checkpoint, with its rows from the log or from ``refill``."""
         bare = template.replace(replay=template.replay.replace(source=None, online=_bare(template)))
         flat = _abstract(bare)
         try:
@@ -211,8 +227,8 @@ class Checkpoints:
             self._check_parts(step, flat.keys())
             raise
         state = _unflatten(bare, {k: np.asarray(v) for k, v in found["train_state"].items()})
-        online = self._read_rows(state, template)
-        replay = template.replay.replace(online=online)
+        rows = self._read_rows(state, template) if refill is None else refill(state)
+        replay = template.replay.replace(online=state.replay.online.replace(rows=rows))
         return state.replace(replay=replay), dict(found["progress"])
 
     def _check_parts(self, step: int, names: Set[str]) -> None:
@@ -252,15 +268,15 @@ class Checkpoints:
         sealed = manifests.inserted_at(self._root, step)
         return _inserted(self._manager, step) if sealed is None else sealed
 
-    def _read_rows(self, state: TrainState, template: TrainState) -> Any:
-        """Rebuild the online ring from the log."""
+    def _read_rows(self, state: TrainState, template: TrainState) -> jax.Array:
+        """Rebuild the rows of the online ring from the log."""
         online = template.replay.online
         total, capacity = int(state.inserted), online.capacity
         rows = np.zeros(online.rows.shape, np.float32)
         begin = max(0, total - capacity)
         for first, part in _stored_rows(self._replay, begin, total):
             rows[np.arange(first, first + len(part)) % capacity] = part
-        return state.replay.online.replace(rows=jnp.asarray(rows))
+        return jnp.asarray(rows)
 
     def _prune(self, capacity: int) -> None:
         """Delete all but the newest checkpoints, then the rows that none of those needs."""

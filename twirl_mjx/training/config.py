@@ -90,6 +90,9 @@ class TrainConfig(WorldConfig):
     """Transitions per compiled epoch, after which Python logs; rounded to whole vector steps."""
     checkpoint_minutes: float = 5.0
     """Wall time between checkpoints of the full training state."""
+    refill: bool = False
+    """Resume without the replay, if checkpoints/replay was left behind: gather as much with the
+    policy. Not bit for bit then."""
 
     def __post_init__(self) -> None:
         """Check names, ranges and divisibility.

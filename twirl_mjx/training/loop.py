@@ -157,7 +157,7 @@ class Batch:
         templates = [self.program.template(index) for index in range(len(self.runs))]
         while True:
             states = [
-                run.restore(template, step)
+                run.restore(template, step, self.program.refill)
                 for run, template in zip(self.runs, templates, strict=True)
             ]
             reached = {int(state.env_steps) for state in states}
@@ -354,6 +354,11 @@ def train(
             for run in batch.runs:
                 if run.checkpoints.stepped_over:
                     logger.announce(run.checkpoints.stepped_over)
+                if run.refilled_rows:
+                    logger.announce(
+                        f"the replay of {run.run_dir.name} was left behind:"
+                        f" {run.refilled_rows:,} transitions were gathered anew with its policy"
+                    )
             states = batch.loop(states, logger, stop)
             steps = int(states.env_steps)
             if steps < batch.config.total_env_steps:

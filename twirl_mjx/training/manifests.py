@@ -19,6 +19,8 @@ from typing import Any
 from twirl_mjx import files
 
 WHAT = "the manifest of a checkpoint"
+ROWS = "replay/"
+"""How the names of files with rows begin."""
 
 
 class DamagedError(ValueError):
@@ -90,8 +92,13 @@ def inserted_at(root: Path, step: int) -> int | None:
     return None if _is_unsealed(root, step) else _read(root, step)[0]
 
 
-def check(root: Path, step: int) -> None:
+def check(root: Path, step: int, *, rows: bool = True) -> None:
     """Compare every file of a checkpoint with its checksum; without a manifest nothing is known.
+
+    Args:
+        root: ``checkpoints`` of the run.
+        step: Env steps of the checkpoint.
+        rows: Whether the rows of its ring are among them.
 
     Raises:
         DamagedError: A file, or the manifest, is missing or damaged.
@@ -99,6 +106,8 @@ def check(root: Path, step: int) -> None:
     if _is_unsealed(root, step):
         return
     for name, expected in _read(root, step)[1].items():
+        if name.startswith(ROWS) and not rows:
+            continue
         path = root / name
         if not path.is_file():
             raise DamagedError(f"{path} is missing")
@@ -155,5 +164,5 @@ def _sums_of_the_one_before(root: Path, step: int) -> dict[str, str]:
                 sums = _read(root, earlier)[1]
             except DamagedError:
                 continue
-            known |= {name: value for name, value in sums.items() if name.startswith("replay/")}
+            known |= {name: value for name, value in sums.items() if name.startswith(ROWS)}
     return known

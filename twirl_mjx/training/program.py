@@ -14,8 +14,10 @@ import jax
 import numpy as np
 
 from twirl_mjx.evaluation.rollout import ActFn, first_episodes, make_evaluate
+from twirl_mjx.replay import ring
 from twirl_mjx.replay import share as share_lib
 from twirl_mjx.replay.config import AUTO
+from twirl_mjx.replay.mixed import MixedReplay
 from twirl_mjx.replay.ring import RingBuffer
 from twirl_mjx.replay.share import Share
 from twirl_mjx.training import seeds as batch
@@ -29,6 +31,8 @@ from twirl_mjx.types import Learner
 from twirl_mjx.worlds.make import make_env
 from twirl_mjx.worlds.vector import EnvState
 
+REFILL = 2
+"""What is folded into a state's key for the actions that refill its ring."""
 Evaluate = Callable[[Any, jax.Array], list[dict[str, np.ndarray]]]
 """(actors of S seeds, key) -> the measures [E] of every seed."""
 
@@ -113,6 +117,7 @@ class Program:
         self.idle_devices: str | None = None
         """Why devices that are there are not used, as a line."""
         self.epoch, self._place = self._compile()
+        self._refill: Any = None
 
     def _compile(self) -> tuple[sharding.Epoch, sharding.Place]:
         """Return the epoch and what puts a state where it runs: seeds or worlds on all devices."""
@@ -160,6 +165,47 @@ class Program:
         return jax.eval_shape(
             lambda key: single.init(config, env, key, None, self._guide), jax.random.key(0)
         )
+
+    def refill(self, state: TrainState) -> jax.Array:
+        """Return rows [C, W] of an online ring, as many as it held, gathered with a state's actor.
+
+        Args:
+            state: Of one seed, as it is alone; its ring has no rows. It is not changed.
+
+        Raises:
+            ValueError: The worlds fail too often.
+        """
+        config, env = self._configs[0], self.env
+
+        def act(online: RingBuffer, state: TrainState) -> tuple[RingBuffer, TrainState]:
+            def step(state: TrainState, _: None) -> tuple[TrainState, None]:
+                key, act_key = jax.random.split(state.key)
+                return single.collect_step(
+                    config, env, state.replace(key=key), act_key, self._guide
+                )[0], None
+
+            bare = state.replay
+            full = state.replace(replay=MixedReplay(source=None, online=online))
+            full, _ = jax.lax.scan(step, full, length=config.steps_per_epoch)
+            return full.replay.online, full.replace(replay=bare)
+
+        if self._refill is None:
+            self._refill = jax.jit(act, donate_argnums=0)
+        wanted = int(state.replay.online.size)
+        sizes = (env.observation_size, env.action_size)
+        online = ring.init(config.replay.capacity, *sizes)
+        state = state.replace(key=jax.random.fold_in(state.key, REFILL))
+        most = 2 * -(-wanted // (config.steps_per_epoch * env.num_envs))
+        for _ in range(most):
+            online, state = self._refill(online, state)
+            if int(online.size) >= wanted:
+                return online.rows
+        if wanted:
+            raise ValueError(
+                f"--refill: only {int(online.size):,} of {wanted:,} transitions could be gathered,"
+                " the worlds failed in the others (nearest: another --name, begun anew)"
+            )
+        return online.rows
 
     def stack(self, states: Sequence[TrainState]) -> TrainState:
         """Return the states of S seeds, each as it is alone, as one.

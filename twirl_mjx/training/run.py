@@ -17,7 +17,7 @@ from twirl_mjx.sim.robots import ROBOTS
 from twirl_mjx.tasks.measures import episode_means, measures_of
 from twirl_mjx.tasks.observations import layout_slices
 from twirl_mjx.training import config_json, rundir
-from twirl_mjx.training.checkpoint import Checkpoints
+from twirl_mjx.training.checkpoint import Checkpoints, Refill
 from twirl_mjx.training.config import TrainConfig
 from twirl_mjx.training.guards import DivergedError
 from twirl_mjx.training.learners import learner_of
@@ -80,6 +80,8 @@ class Run:
         self.replay_ratio = self.config.droq.utd * self.config.droq.batch_size
         self.source_rows = 0.0 if part.source is None else float(part.source.size)
         self.resumed_at: int | None = None
+        self.refilled_rows = 0
+        """Rows of the ring that were gathered anew, because they had been left behind."""
         self.fault: DivergedError | None = None
         """Why this seed goes on no more, although others may."""
         self.progress: dict[str, Any] = {
@@ -87,8 +89,10 @@ class Run:
             "wall_s": 0.0,
             "inserted": 0,
             "first_drop": "",
+            "refilled": [],
         }
-        """What a checkpoint holds beside the state; ``first_drop``: why, empty if none was."""
+        """What a checkpoint holds beside the state; ``first_drop``: why, empty if none was;
+        ``refilled``: transitions at which the replay was gathered anew."""
         self._env = env
         self._stage = stage
 
@@ -106,12 +110,15 @@ class Run:
             config=config_json.flatten(self.config),
         )
 
-    def restore(self, template: TrainState, step: int) -> TrainState:
+    def restore(self, template: TrainState, step: int, refill: Refill) -> TrainState:
         """Return the checkpoint at ``step``; later ones are deleted."""
         self.checkpoints.back_to(step)
-        state, progress = self.checkpoints.restore(template)
+        state, progress = self.checkpoints.restore(template, refill if self.config.refill else None)
         self.resumed_at = int(state.env_steps)
         self.progress |= progress
+        if self.checkpoints.refilled:
+            self.refilled_rows = int(state.replay.online.size)
+            self.progress["refilled"] = [*self.progress["refilled"], self.resumed_at]
         return state
 
     def evaluated(
@@ -147,6 +154,8 @@ class Run:
             "robot": ROBOTS.reference(self.config.robot) or self.config.robot,
             "evaluation": means,
         }
+        if self.progress["refilled"]:
+            card["replay_refilled_at"] = self.progress["refilled"]
         header = make_header(self.config, self._env, card)
         save_policy(path, jax.tree.map(np.asarray, actor), header)
 

@@ -34,7 +34,7 @@ PACKAGES = (
     "orbax-checkpoint", "numpy",
 )  # fmt: skip
 MAY_CHANGE = (
-    "total_env_steps:", "checkpoint_minutes:", "eval.", "engine:", "source:", "uses:",
+    "total_env_steps:", "checkpoint_minutes:", "refill:", "eval.", "engine:", "source:", "uses:",
     "source_contract:", "source_command:", "allow_clipping:",
 )  # fmt: skip
 """How the lines of a difference begin that a resumed run may have: they do not alter what was done
