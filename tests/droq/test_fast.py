@@ -133,7 +133,8 @@ def test_kernels_are_the_same_for_several_learners_at_once(small_config, transit
 @pytest.mark.parametrize(
     ("settings", "reason"),
     [
-        ({"hidden_sizes": (256, 100)}, r"powers of two from 16, not 100 \(nearest: 128\)"),
+        ({"hidden_sizes": (256, 100)}, r"powers of two from 16 to 512, not 100 \(nearest: 128\)"),
+        ({"hidden_sizes": (1024,)}, r"not 1024 \(nearest: 512\)"),
         ({"hidden_sizes": (8,)}, r"not 8 \(nearest: 16\)"),
         ({"batch_size": 250}, r"multiple of 16, not 250 \(nearest: 256\)"),
     ],
@@ -230,6 +231,7 @@ def test_the_backend_chooses_the_form(monkeypatch):
         (["9.0"], {"batch_size": 1024}, "accelerator"),
         (["9.0"], {"batch_size": 250}, "accelerator"),
         (["9.0"], {"hidden_sizes": (256, 200)}, "accelerator"),
+        (["9.0"], {"hidden_sizes": (512, 256)}, "accelerator"),
     ],
 )
 def test_kernels_are_chosen_where_they_were_timed(monkeypatch, capabilities, settings, form):

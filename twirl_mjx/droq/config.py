@@ -76,10 +76,11 @@ class DroqConfig:
     def kernels_refuse(self) -> str | None:
         """Return which size hand-written kernels cannot cut into blocks, or None."""
         for size in self.hidden_sizes:
-            if size < 16 or size & (size - 1):
-                nearest = max(16, 1 << round(math.log2(size)))
+            if not 16 <= size <= 512 or size & (size - 1):
+                nearest = min(max(16, 1 << round(math.log2(size))), 512)
                 return (
-                    f"hidden sizes that are powers of two from 16, not {size} (nearest: {nearest})"
+                    f"hidden sizes that are powers of two from 16 to 512, not {size}"
+                    f" (nearest: {nearest})"
                 )
         if self.batch_size % 16:
             nearest = max(16, round(self.batch_size / 16) * 16)

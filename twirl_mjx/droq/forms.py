@@ -15,9 +15,9 @@ FORMS: dict[str, ModuleType] = dict(zip(FORM_NAMES, _MODULES, strict=True))
 """Name -> module with ``critic_q`` and ``critic_block``."""
 
 
-KERNELS_BATCH = 512
-"""Rows of the largest minibatch for which kernels are chosen: they are for many small updates, and
-were timed at 256 only (docs/accelerators.md)."""
+KERNELS_BATCH, KERNELS_UNITS = 512, 256
+"""Most rows and units for which kernels are chosen: they are for many small updates, and were timed
+at 256 rows (docs/accelerators.md); the tiles of wider layers do not fit every card."""
 
 
 def name_of(config: DroqConfig) -> str:
@@ -28,7 +28,7 @@ def name_of(config: DroqConfig) -> str:
         return config.form
     if jax.default_backend() == "cpu":
         return "fast"
-    small = config.batch_size <= KERNELS_BATCH
+    small = config.batch_size <= KERNELS_BATCH and max(config.hidden_sizes) <= KERNELS_UNITS
     return "kernels" if small and not config.kernels_refuse() and _one_nvidia() else "accelerator"
 
 
