@@ -8,10 +8,11 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
-from twirl_mjx import files
-from twirl_mjx.bench import gpu_proof, gpu_table, report
+from twirl_mjx import array_files, files
+from twirl_mjx.bench import gpu_proof, gpu_table, parity, report
 from twirl_mjx.bench.gpu_proof import Folder, GpuProofBench
 from twirl_mjx.bench.gpu_table import GpuTableBench
 
@@ -84,6 +85,30 @@ def test_a_failed_variant_is_a_row_and_is_tried_again(
     assert not any(row["fault"] for row in second)
 
 
+def test_numbers_that_are_missing_are_made_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = {f"{part}.x": np.ones((1, 1)) for part in ("native", "epoch")}
+    whole |= {f"learner.{form}.x": np.ones(1) for form in parity.forms.FORMS}
+    lame = {name: value for name, value in whole.items() if "kernels" not in name}
+    made: list[str] = []
+    given = {"reference.npz": [lame, whole], "numbers.npz": [lame, whole]}
+
+    def write(path: Path, *_: Any) -> parity.Numbers:
+        made.append(path.name)
+        found = given[path.name].pop(0)
+        array_files.write_npz(path, found)
+        return found
+
+    monkeypatch.setattr(parity, "write", write)
+    options, folder = GpuProofBench(tiny=True), Folder(tmp_path)
+    given["numbers.npz"][0] = lame | {"learner.kernels.x": np.full(1, np.nan)}
+    for expected in (2, 4, 4):  # all made, all made again, nothing missing
+        rows = gpu_proof.prove_parity(options, folder, 1e9)["rows"]
+        assert len(made) == expected
+    assert {row["error"] for row in rows} == {0.0}
+
+
 def test_a_full_disk_is_said_once_and_loses_no_result(
     tmp_path: Path,
     fake: type[FakeWorker],
@@ -119,7 +144,7 @@ def test_table_shows_what_a_folder_holds(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"no proof was made.*gpu-proof"):
         gpu_table.measure(options)
     folder.write_machine(MACHINE)
-    fault = {"name": "mjx, worlds 8", "unit": "u", "rate": 0.0, "spread": 0.0, "ready_s": 0.0}
+    fault = {"name": "mjx, worlds 8", "unit": "u", "rate": 0.0, "spread": 0.0}
     timed = fault | {"name": "fast, seeds 1", "rate": 5123.0, "spread": 0.04, "fault": ""}
     folder.write(gpu_proof.TIMINGS, [timed, fault | {"fault": "status 1"}])
     errors = {"learner.fast.actor": 1e-4, "learner.fast.critic": 2e-3, "native.qpos": 1e-6}

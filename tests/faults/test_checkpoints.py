@@ -167,14 +167,23 @@ def test_when_none_is_whole_nothing_is_deleted(
     assert sorted(run_dir.rglob("*")) == before
 
 
-def test_a_replay_that_was_left_behind_is_gathered_anew_when_asked(
-    saved: Path, fresh: TrainState, tmp_path: Path
+def remove_rows(run_dir: Path) -> None:
+    shutil.rmtree(run_dir / "checkpoints" / "replay")
+
+
+def remove_a_file_of_rows(run_dir: Path) -> None:
+    (run_dir / "checkpoints" / "replay" / "rows_000000000064_000000000096.npy").unlink()
+
+
+@pytest.mark.parametrize("remove", [remove_rows, remove_a_file_of_rows])
+def test_a_replay_that_is_not_whole_is_gathered_anew_when_asked(
+    remove: Callable[[Path], None], saved: Path, fresh: TrainState, tmp_path: Path
 ) -> None:
     run_dir = tmp_path / "run"
     shutil.copytree(saved, run_dir)
-    shutil.rmtree(run_dir / "checkpoints" / "replay")
+    remove(run_dir)
     before = sorted(run_dir.rglob("*.json"))
-    with pytest.raises(DamagedError, match=r"replay of .*run was left behind.*--refill"):
+    with pytest.raises(DamagedError, match=r"is missing.*Only its replay.*--refill"):
         restore(run_dir, fresh)
     assert sorted(run_dir.rglob("*.json")) == before
     asked = []
@@ -185,12 +194,28 @@ def test_a_replay_that_was_left_behind_is_gathered_anew_when_asked(
 
     checkpoints = Checkpoints(run_dir)
     found, _ = checkpoints.restore(jax.eval_shape(lambda: fresh), refill)
-    assert asked == [(160, 0)]
-    assert checkpoints.refilled and not checkpoints.stepped_over
-    np.testing.assert_array_equal(found.replay.online.rows, after(fresh, 160).replay.online.rows)
-    checkpoints.save(after(fresh, 192), {"inserted": 192, "best": 0.5})
     checkpoints.close()
-    assert restore(run_dir, fresh) == (192, None)  # whole again, rows and all
+    assert asked == [(160, 0)] and checkpoints.refilled and not checkpoints.stepped_over
+    np.testing.assert_array_equal(found.replay.online.rows, after(fresh, 160).replay.online.rows)
+    assert restore(run_dir, fresh) == (160, None)  # stored at once: nothing is gathered twice
+    save(run_dir, fresh, 192)
+    flip(next((run_dir / "checkpoints" / "orbax" / "192" / "train_state" / "d").iterdir()))
+    assert restore(run_dir, fresh)[0] == 160  # and a later one that is damaged is stepped over
+
+
+def test_refill_does_not_hide_a_damaged_state(
+    saved: Path, fresh: TrainState, tmp_path: Path
+) -> None:
+    run_dir = tmp_path / "run"
+    shutil.copytree(saved, run_dir)
+    remove_rows(run_dir)
+    for step in (128, 160):
+        flip(next((run_dir / "checkpoints" / "orbax" / str(step) / "train_state" / "d").iterdir()))
+    for refill in (None, lambda _: pytest.fail("asked")):
+        checkpoints = Checkpoints(run_dir)
+        with pytest.raises(DamagedError, match=r"160.*is damaged.*Give another --name"):
+            checkpoints.restore(jax.eval_shape(lambda: fresh), refill)
+        checkpoints.close()
 
 
 def test_refill_is_not_asked_for_rows_that_are_there(saved: Path, fresh: TrainState) -> None:

@@ -123,6 +123,12 @@ def numbers(engines: Sequence[str] = ENGINES) -> Numbers:
         return out | _attempt("an epoch", epoch_numbers)
 
 
+def is_complete(found: Mapping[str, np.ndarray], engines: Sequence[str] = ENGINES) -> bool:
+    """Return whether numbers have every form, engine and an epoch."""
+    parts = [f"learner.{form}." for form in forms.FORMS] + [f"{e}." for e in engines] + ["epoch."]
+    return all(any(name.startswith(part) for name in found) for part in parts)
+
+
 def errors(found: Mapping[str, np.ndarray], want: Mapping[str, np.ndarray]) -> dict[str, float]:
     """Return the relative error of every array; infinite where one is missing or not finite.
 

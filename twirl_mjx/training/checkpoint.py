@@ -102,7 +102,7 @@ class Checkpoints:
         self.stepped_over: str | None = None
         """What :meth:`restore` found damaged and where it went on from, as a line."""
         self.refilled = False
-        """Whether :meth:`restore` found no row of the ring and had them gathered anew."""
+        """Whether :meth:`restore` had the rows of the ring gathered anew."""
         cut_short = set(manifests.stored(self._root)) - set(manifests.visible(self._root))
         for folder in (
             *self._root.glob("orbax/*.orbax-checkpoint-tmp*"),
@@ -171,8 +171,9 @@ class Checkpoints:
         """Return the newest good checkpoint as a state shaped like ``template``, and its progress.
 
         Damaged ones are stepped over: ``stepped_over`` says so, and they are deleted, since the
-        run will write them again. The source ring is taken from ``template``. A run of which all
-        rows were left behind is damaged, too, unless there is ``refill``.
+        run will write them again. The source ring is taken from ``template``. With ``refill`` a
+        checkpoint is good whose rows alone are missing or damaged: they are gathered anew and
+        stored, and the older checkpoints, which need the old ones, are deleted.
 
         Raises:
             FileNotFoundError: There is none.
@@ -183,12 +184,10 @@ class Checkpoints:
         if not steps:
             raise FileNotFoundError(f"no checkpoint in {self._root}")
         damage: list[str] = []
-        left_behind = not _segments(self._replay)
-        self.refilled = left_behind and refill is not None
         for step in reversed(steps):
             try:
-                manifests.check(self._root, step, rows=not self.refilled)
-                found = self._read(step, template, refill if self.refilled else None)
+                manifests.check(self._root, step, rows=refill is None)
+                found = self._read(step, template, refill)
             except DamagedError as error:
                 damage.append(str(error))
                 continue
@@ -199,21 +198,23 @@ class Checkpoints:
                     f"{damage[0]}; going on from the checkpoint before it, at {step:,} transitions"
                 )
             return found
-        if left_behind:
+        told = f"{damage[0]}; no checkpoint of {self._run_dir} is whole, so it cannot go on. "
+        if refill is None and any(
+            manifests.is_whole(self._root, step, rows=False) for step in steps
+        ):
             raise DamagedError(
-                f"{self._replay} is empty: the replay of {self._run_dir} was left behind. Nothing"
-                " was touched (nearest: --refill, which gathers as much anew with its policy)"
+                told + "Only its replay is missing or damaged (nearest: --refill, which gathers as"
+                " much anew with its policy)"
             )
         raise DamagedError(
-            f"{damage[0]}; no checkpoint of {self._run_dir} is whole, so it cannot go on. Give"
-            " another --name; its policy can start that run: --variant weights --source"
+            told + "Give another --name; its policy can start that run: --variant weights --source"
             f" {self._run_dir / BEST_POLICY}"
         )
 
     def _read(
         self, step: int, template: TrainState, refill: Refill | None
     ) -> tuple[TrainState, dict[str, Any]]:
-        """Return one checkpoint, with its rows from the log or from ``refill``."""
+        """Return one checkpoint; rows that are not whole come from ``refill``, and are stored."""
         bare = template.replace(replay=template.replay.replace(source=None, online=_bare(template)))
         flat = _abstract(bare)
         try:
@@ -227,9 +228,29 @@ class Checkpoints:
             self._check_parts(step, flat.keys())
             raise
         state = _unflatten(bare, {k: np.asarray(v) for k, v in found["train_state"].items()})
-        rows = self._read_rows(state, template) if refill is None else refill(state)
+        if refill is None or manifests.is_whole(self._root, step):
+            rows = self._read_rows(state, template)
+        else:
+            rows = refill(state)
+            self._store_anew(step, int(state.inserted), np.asarray(rows))
         replay = template.replay.replace(online=state.replay.online.replace(rows=rows))
         return state.replace(replay=replay), dict(found["progress"])
+
+    def _store_anew(self, step: int, total: int, rows: np.ndarray) -> None:
+        """Put the rows of a ring [C, W] in the place of the log, for one checkpoint alone."""
+        for other in manifests.visible(self._root):
+            if other != step:
+                self._delete(other)
+        for _, _, path in _segments(self._replay):
+            path.unlink()
+        first = max(0, total - len(rows))
+        target = self._segment(first, total)
+        array_files.write_npy(target, rows[np.arange(first, total) % len(rows)])
+        manifests.seal(self._root, step, total, [target])
+        self.refilled = True
+
+    def _segment(self, first: int, end: int) -> Path:
+        return self._replay / f"rows_{first:012d}_{end:012d}.npy"
 
     def _check_parts(self, step: int, names: Set[str]) -> None:
         """Raise ValueError where a stored state has other parts than ``names``."""
@@ -260,8 +281,7 @@ class Checkpoints:
         if first >= total:
             return
         rows = np.asarray(state.replay.online.rows)[np.arange(first, total) % capacity]
-        target = self._replay / f"rows_{first:012d}_{total:012d}.npy"
-        array_files.write_npy(target, rows)
+        array_files.write_npy(self._segment(first, total), rows)
 
     def _logged(self, step: int) -> int:
         """Return how many rows had been inserted at a checkpoint."""
@@ -338,6 +358,11 @@ def _bare(state: TrainState) -> Any:
 def has_checkpoint(run_dir: Path) -> bool:
     """Return whether a run can be resumed; nothing is created."""
     return newest_checkpoint(run_dir) is not None
+
+
+def lacks_replay(run_dir: Path) -> bool:
+    """Return whether a run can be resumed, but for its replay, of which nothing is there."""
+    return has_checkpoint(run_dir) and not _segments(run_dir / "checkpoints" / "replay")
 
 
 def newest_checkpoint(run_dir: Path) -> int | None:

@@ -91,8 +91,8 @@ class TrainConfig(WorldConfig):
     checkpoint_minutes: float = 5.0
     """Wall time between checkpoints of the full training state."""
     refill: bool = False
-    """Resume without the replay, if checkpoints/replay was left behind: gather as much with the
-    policy. Not bit for bit then."""
+    """Where checkpoints/replay was left behind, or is damaged: gather as much anew with the policy,
+    and resume. Not bit for bit then."""
 
     def __post_init__(self) -> None:
         """Check names, ranges and divisibility.

@@ -356,7 +356,7 @@ def train(
                     logger.announce(run.checkpoints.stepped_over)
                 if run.refilled_rows:
                     logger.announce(
-                        f"the replay of {run.run_dir.name} was left behind:"
+                        f"the replay of {run.run_dir.name} was not whole:"
                         f" {run.refilled_rows:,} transitions were gathered anew with its policy"
                     )
             states = batch.loop(states, logger, stop)

@@ -115,6 +115,15 @@ def check(root: Path, step: int, *, rows: bool = True) -> None:
             raise DamagedError(f"{path} is damaged: its checksum is not that of what was saved")
 
 
+def is_whole(root: Path, step: int, *, rows: bool = True) -> bool:
+    """Return whether :func:`check` finds nothing."""
+    try:
+        check(root, step, rows=rows)
+    except DamagedError:
+        return False
+    return True
+
+
 def forget(root: Path, step: int) -> None:
     """Make a checkpoint invisible, for good even if the power is cut."""
     if _is_unsealed(root, step):

@@ -23,6 +23,7 @@ from twirl_mjx.policies import recorded, rows
 from twirl_mjx.policies.resolve import SCRIPTED_SOURCES, Source, check_acts, resolve_policy
 from twirl_mjx.replay import ring
 from twirl_mjx.training import config_json, loop, memory, rundir, source_rules
+from twirl_mjx.training.checkpoint import lacks_replay
 from twirl_mjx.training.collection import Collectors, Say, describe, source_data
 from twirl_mjx.training.config import TrainConfig, of_program
 from twirl_mjx.training.presets import make_config
@@ -318,6 +319,9 @@ def _train(members: list[Member], say: Say, deadline: float) -> None:
                 data = rings[place]
         policy = source.policy if source is not None and config.guide != "none" else None
         parts.append(Part(config, run_dir, data, initial, member.sinks, policy))
+    for run_dir in (part.run_dir for part in parts if part.config.refill):
+        if lacks_replay(run_dir.path):
+            say(f"{run_dir}: its replay was left behind; gathering as much with its policy first")
     outcomes = loop.train(parts, stage=config.task, deadline=deadline)
     if not all(outcome.finished for outcome in outcomes):
         names = ", ".join(part.run_dir.name for part in parts)

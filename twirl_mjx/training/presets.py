@@ -26,7 +26,7 @@ SETTINGS: dict[str, Mapping[str, Any]] = {
         "eval.every": 96_000,
         "eval.episodes": 32,
     },
-    "massive": {  # few updates of large batches per transition; a start, trained on no card yet
+    "massive": {  # few updates of large batches per transition; not tuned (docs/lab-notes.md)
         "total_env_steps": 40_960_000,
         "warmup_env_steps": 40_960,
         "epoch_env_steps": 204_800,

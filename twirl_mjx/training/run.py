@@ -81,7 +81,7 @@ class Run:
         self.source_rows = 0.0 if part.source is None else float(part.source.size)
         self.resumed_at: int | None = None
         self.refilled_rows = 0
-        """Rows of the ring that were gathered anew, because they had been left behind."""
+        """Rows of the ring that were gathered anew."""
         self.fault: DivergedError | None = None
         """Why this seed goes on no more, although others may."""
         self.progress: dict[str, Any] = {
