@@ -352,13 +352,8 @@ def train(
             if batch.program.idle_devices:
                 logger.announce(batch.program.idle_devices)
             for run in batch.runs:
-                if run.checkpoints.stepped_over:
-                    logger.announce(run.checkpoints.stepped_over)
-                if run.refilled_rows:
-                    logger.announce(
-                        f"the replay of {run.run_dir.name} was not whole:"
-                        f" {run.refilled_rows:,} transitions were gathered anew with its policy"
-                    )
+                for note in run.notes:
+                    logger.announce(note)
             states = batch.loop(states, logger, stop)
             steps = int(states.env_steps)
             if steps < batch.config.total_env_steps:

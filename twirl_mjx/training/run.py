@@ -80,8 +80,8 @@ class Run:
         self.replay_ratio = self.config.droq.utd * self.config.droq.batch_size
         self.source_rows = 0.0 if part.source is None else float(part.source.size)
         self.resumed_at: int | None = None
-        self.refilled_rows = 0
-        """Rows of the ring that were gathered anew."""
+        self.notes: list[str] = []
+        """What was unusual about how this seed resumed, as lines."""
         self.fault: DivergedError | None = None
         """Why this seed goes on no more, although others may."""
         self.progress: dict[str, Any] = {
@@ -116,9 +116,14 @@ class Run:
         state, progress = self.checkpoints.restore(template, refill if self.config.refill else None)
         self.resumed_at = int(state.env_steps)
         self.progress |= progress
+        if self.checkpoints.stepped_over:
+            self.notes.append(self.checkpoints.stepped_over)
         if self.checkpoints.refilled:
-            self.refilled_rows = int(state.replay.online.size)
             self.progress["refilled"] = [*self.progress["refilled"], self.resumed_at]
+            self.notes.append(
+                f"the replay of {self.run_dir.name} was not whole:"
+                f" {int(state.replay.online.size):,} transitions were gathered anew with its policy"
+            )
         return state
 
     def evaluated(
