@@ -203,6 +203,23 @@ def test_a_replay_that_is_not_whole_is_gathered_anew_when_asked(
     assert restore(run_dir, fresh)[0] == 160  # and a later one that is damaged is stepped over
 
 
+def test_refill_goes_on_from_the_checkpoint_before_a_damaged_state(
+    saved: Path, fresh: TrainState, tmp_path: Path
+) -> None:
+    run_dir = tmp_path / "run"
+    shutil.copytree(saved, run_dir)
+    remove_rows(run_dir)
+    flip(next((run_dir / "checkpoints" / "orbax" / "160" / "train_state" / "d").iterdir()))
+    checkpoints = Checkpoints(run_dir)
+    found, _ = checkpoints.restore(
+        jax.eval_shape(lambda: fresh), lambda _: after(fresh, 128).replay.online.rows
+    )
+    checkpoints.close()
+    assert int(found.env_steps) == 128 and checkpoints.refilled
+    assert "160" in str(checkpoints.stepped_over)
+    assert restore(run_dir, fresh) == (128, None)
+
+
 def test_refill_does_not_hide_a_damaged_state(
     saved: Path, fresh: TrainState, tmp_path: Path
 ) -> None:

@@ -238,9 +238,9 @@ class Checkpoints:
 
     def _store_anew(self, step: int, total: int, rows: np.ndarray) -> None:
         """Put the rows of a ring [C, W] in the place of the log, for one checkpoint alone."""
-        for other in manifests.visible(self._root):
-            if other != step:
-                self._delete(other)
+        for older in manifests.visible(self._root):
+            if older < step:
+                self._delete(older)
         for _, _, path in _segments(self._replay):
             path.unlink()
         first = max(0, total - len(rows))
