@@ -23,6 +23,7 @@ os.environ["MPLBACKEND"] = "Agg"
 # Programs that run for a second are not worth half a minute of LLVM's optimisation: compiling
 # `train_epoch` of the debug preset takes 12 s of processor time instead of 31.
 _LEVEL = "--xla_backend_optimization_level=0"
+os.environ["JAX_NUM_CPU_DEVICES"] = "1"  # else the first batch of seeds chooses for all tests
 os.environ["XLA_FLAGS"] = f"{_LEVEL} {os.environ.get('XLA_FLAGS', '')}".strip()
 _CACHE = os.environ.get("TWIRL_CACHE_DIR", str(Path.home() / ".cache" / "twirl_mjx" / "jax"))
 if _CACHE != "off":  # the same place and rule as the command line's

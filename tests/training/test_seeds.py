@@ -134,6 +134,7 @@ def test_one_seed_can_be_saved(
     policy = load_policy(tmp_path / "seed5" / "policy.npz")
     assert policy.header.card["seed"] == SEEDS[1]
     assert policy.header.card["grad_steps"] == 64
+    assert policy.header.card["form"] == "fast"  # what ``auto`` means on a CPU
     obs = np.random.default_rng(0).normal(size=(5, 101)).astype(np.float32)
     actor = jax.tree.map(jnp.asarray, chosen.learner.actor)
     expected = droq.mean_action(actor, jnp.asarray(obs))

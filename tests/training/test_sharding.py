@@ -94,6 +94,7 @@ PROGRAM = """
     from twirl_mjx import cli
     from twirl_mjx.training.program import Program
 
+    sharding.worlds_pay = lambda: True  # as on accelerators
     words = "train --task stand --preset debug --variant scratch --num-envs 4"
     words += " --droq.hidden-sizes 32 --warmup-env-steps 64 --epoch-env-steps 64 --runs FOLDER"
     for count in (1, 2, 3):
@@ -105,6 +106,42 @@ PROGRAM = """
 """
 
 
+CORES = """
+    from pathlib import Path
+
+    import jax
+    import numpy as np
+    from twirl_mjx import cli
+    from twirl_mjx.machine import usable_cores
+    from twirl_mjx.training import sharding
+
+    words = "train --task stand --preset debug --variant scratch --droq.hidden-sizes 32"
+    words += " --warmup-env-steps 64 --epoch-env-steps 64 --runs FOLDER"
+
+    def train(name, total, *seeds):
+        chosen = ["--name", name, "--total-env-steps", str(total), "--seeds", *map(str, seeds)]
+        assert cli.main([*words.split(), *chosen]) == 0
+
+    def weights(name):
+        with np.load(Path("FOLDER") / name / "policy_last.npz") as file:
+            return {key: file[key] for key in file.files if file[key].dtype == np.float32}
+
+    train("parts", 128, 3, 5)
+    assert jax.device_count() == sharding.num_cpu_devices(2, len(usable_cores()))
+    train("parts", 256, 3, 5)
+    train("whole", 256, 3, 5)
+    train("alone", 256, 5)
+    for seed in (3, 5):
+        parts, whole = weights(f"parts-s{seed}"), weights(f"whole-s{seed}")
+        assert parts.keys() == whole.keys() and len(parts) >= 4
+        for key in whole:
+            np.testing.assert_array_equal(parts[key], whole[key], err_msg=key)
+    for key, value in weights("alone-s5").items():  # whole is that of seed 5
+        np.testing.assert_allclose(whole[key], value, atol=1e-4, err_msg=key)
+    print("the same")
+"""
+
+
 def run_child(body: str, engine: str, error: float) -> str:
     """Run a comparison in which numbers may differ by ``error``, relative and absolute.
 
@@ -112,10 +149,16 @@ def run_child(body: str, engine: str, error: float) -> str:
     differently, and contacts amplify that, so the comparison covers 0.2 s of simulated time.
     """
     code = textwrap.dedent(CHILD) + textwrap.dedent(body)
-    child = dict(os.environ)
-    child["XLA_FLAGS"] += " --xla_force_host_platform_device_count=2"  # conftest has set it
+    flag = " --xla_force_host_platform_device_count=2"
+    return run_python(code.replace("ENGINE", engine).replace("ERROR", str(error)), flag)
+
+
+def run_python(code: str, flag: str = "") -> str:
+    """Run a program in a process of its own that may choose its devices; returns its output."""
+    child = {name: value for name, value in os.environ.items() if name != "JAX_NUM_CPU_DEVICES"}
+    child["XLA_FLAGS"] += flag  # conftest has set it
     done = subprocess.run(
-        [sys.executable, "-c", code.replace("ENGINE", engine).replace("ERROR", str(error))],
+        [sys.executable, "-c", code],
         env=child,
         capture_output=True,
         text=True,
@@ -150,6 +193,37 @@ def test_epochs_keep_the_shapes_of_their_state(stand_config: TrainConfig, env: V
 
 def shapes(tree: TrainState) -> list[tuple[tuple[int, ...], str]]:
     return [(leaf.shape, str(leaf.dtype)) for leaf in jax.tree.leaves(tree)]
+
+
+@pytest.mark.parametrize(
+    ("num_seeds", "on_1_2_4_16_cores"),
+    [
+        (1, [1, 1, 1, 1]),
+        (2, [1, 2, 2, 2]),
+        (3, [1, 3, 3, 3]),  # three devices on two cores, which share them
+        (4, [1, 2, 4, 4]),
+        (5, [1, 1, 5, 5]),  # five on two cores would be too many
+        (6, [1, 2, 6, 6]),
+        (8, [1, 2, 4, 8]),
+        (32, [1, 2, 4, 16]),
+    ],
+)
+def test_cpu_devices_fill_the_cores(num_seeds: int, on_1_2_4_16_cores: list[int]) -> None:
+    assert [sharding.num_cpu_devices(num_seeds, c) for c in (1, 2, 4, 16)] == on_1_2_4_16_cores
+
+
+def test_a_number_of_cpu_devices_that_was_set_stays(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[int] = []
+    monkeypatch.setattr(jax.config, "update", lambda _, value: asked.append(value))
+    sharding.make_cpu_devices(4)  # conftest sets JAX_NUM_CPU_DEVICES
+    assert asked == []
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1900)
+def test_a_batch_of_seeds_has_a_device_a_core(tmp_path: Path) -> None:
+    said = run_python(textwrap.dedent(CORES.replace("FOLDER", str(tmp_path))))
+    assert "device is used" not in said and said.endswith("the same\n")
 
 
 @pytest.mark.slow

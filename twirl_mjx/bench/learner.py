@@ -16,6 +16,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import NamedSharding, PartitionSpec
 
 from twirl_mjx.bench import matmuls
 from twirl_mjx.bench.measure import (
@@ -32,6 +33,7 @@ from twirl_mjx.droq import forms
 from twirl_mjx.droq import learner as droq
 from twirl_mjx.machine import usable_cores
 from twirl_mjx.replay import mixed, ring
+from twirl_mjx.training import sharding
 
 ROWS = 50_000
 """Transitions in the replay, as in the SBX peer."""
@@ -89,7 +91,14 @@ def make_learner(options: LearnerBench, seeds: int) -> tuple[Chain, int]:
     # One first state for all seeds: what they draw differs, and only the time matters.
     learners = jax.tree.map(lambda x: jnp.asarray(np.stack([np.asarray(x)] * seeds)), learner)
     state = learners, jax.random.split(jax.random.key(1), seeds)
-    return Chain(jax.vmap(run), state, online), BLOCKS * options.utd * seeds
+    work = BLOCKS * options.utd * seeds
+    devices = sharding.devices_for(seeds)
+    if devices == 1:
+        return Chain(jax.vmap(run), state, online), work
+    mesh = sharding.device_mesh(sharding.SEEDS, devices)
+    spec = PartitionSpec(sharding.SEEDS)
+    spread = jax.shard_map(jax.vmap(run), mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False)
+    return Chain(spread, *jax.device_put((state, online), NamedSharding(mesh, spec))), work
 
 
 def make_bound(options: LearnerBench, layout: matmuls.Layout) -> tuple[Chain, int]:
@@ -167,6 +176,7 @@ def sbx_samples(options: LearnerBench, seconds: float) -> list[float]:
 def measure(options: LearnerBench) -> Record:
     """Measure everything in turn, ``options.rounds`` times."""
     jax.config.update("jax_enable_compilation_cache", False)  # compile_s is cold
+    sharding.make_cpu_devices(options.num_seeds)
     record_machine = machine()
     reasons = {"sbx": sbx_missing(options), "workers": pinning_missing(options.num_workers)}
     progress("bench learner: compiling")
@@ -230,6 +240,7 @@ def _record(
         "matmul_gflop_per_update": matmuls.flops(shapes) / 1e9,
         "share_of_matmul_bound": median["single"] / median[layout],
         "seeds": options.num_seeds,
+        "seeds_devices": sharding.devices_for(options.num_seeds),
         "seeds_updates_per_s": together["vmap"],
         "workers": len(workers),
         "workers_updates_per_s": together.get("workers"),

@@ -22,7 +22,7 @@ from twirl_mjx.checks import check_once, choose_one
 from twirl_mjx.policies import recorded, rows
 from twirl_mjx.policies.resolve import SCRIPTED_SOURCES, Source, check_acts, resolve_policy
 from twirl_mjx.replay import ring
-from twirl_mjx.training import config_json, loop, memory, rundir, source_rules
+from twirl_mjx.training import config_json, loop, memory, rundir, sharding, source_rules
 from twirl_mjx.training.checkpoint import lacks_replay
 from twirl_mjx.training.collection import Collectors, Say, describe, source_data
 from twirl_mjx.training.config import TrainConfig, of_program
@@ -151,6 +151,7 @@ def run_together(
         for config, name in zip(configs, names, strict=True)
     ]
     check_once("the names of the runs", list(map(str, found)))
+    sharding.make_cpu_devices(len(found))
     members = [
         Member(*each) for each in zip(configs, found, resolve_each(sinks, len(found)), strict=True)
     ]

@@ -121,26 +121,32 @@ class Program:
 
     def _compile(self) -> tuple[sharding.Epoch, sharding.Place]:
         """Return the epoch and what puts a state where it runs: seeds or worlds on all devices."""
-        config, env, own = self._configs[0], self.env, self._own_sources
-        alone = self.num_seeds == 1
-        devices, guide = jax.device_count(), self._guide
-        if devices > 1 and guide is not None:
-            self.idle_devices = f"one device is used: guide {config.guide} works on one"
-        elif devices > 1:
-            what = ("num_envs", env.num_envs) if alone else ("seeds", self.num_seeds)
-            try:
-                sharding.check_even(*what, devices)
-            except ValueError as error:
-                self.idle_devices = f"one device is used: {error}"
+        config, env, own, guide = self._configs[0], self.env, self._own_sources, self._guide
+        if self.num_seeds > 1:
+            used = sharding.devices_for(self.num_seeds)
+            self._note_idle("seeds", self.num_seeds, used)
+            if used > 1:
+                mesh = sharding.device_mesh(sharding.SEEDS, used)
+                return sharding.spread_seeds(config, env, mesh, own_sources=own, guide=guide)
+            epoch = batch.compile_epoch_seeds(config, env, own_sources=own, guide=guide)
+            return epoch, lambda states: states
+        if jax.device_count() > 1 and sharding.worlds_pay():
+            if guide is not None:
+                self.idle_devices = f"one device is used: guide {config.guide} works on one"
+            elif env.num_envs % jax.device_count():
+                self._note_idle("num_envs", env.num_envs, 1)
             else:
-                mesh = sharding.device_mesh(sharding.WORLDS if alone else sharding.SEEDS)
-                if alone:
-                    return sharding.spread_worlds(config, env, mesh)
-                return sharding.spread_seeds(config, env, mesh, own_sources=own)
-        if alone:
-            return single.compile_epoch(config, env, guide), lambda state: state
-        epoch = batch.compile_epoch_seeds(config, env, own_sources=own, guide=guide)
-        return epoch, lambda states: states
+                mesh = sharding.device_mesh(sharding.WORLDS)
+                return sharding.spread_worlds(config, env, mesh)
+        return single.compile_epoch(config, env, guide), lambda state: state
+
+    def _note_idle(self, what: str, number: int, used: int) -> None:
+        """Say why not all devices are used, where that is so."""
+        try:
+            sharding.check_even(what, number, jax.device_count())
+        except ValueError as error:
+            of = "one device is" if used == 1 else f"{used} devices are"
+            self.idle_devices = f"{of} used: {error}"
 
     def init(self) -> TrainState:
         """Return the states of all seeds before the first transition, without source rings."""

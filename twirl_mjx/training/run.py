@@ -11,6 +11,8 @@ from typing import Any
 import jax
 import numpy as np
 
+from twirl_mjx.droq import forms
+from twirl_mjx.droq.config import DroqConfig
 from twirl_mjx.policies.learned import PolicyHeader, save_policy
 from twirl_mjx.replay.ring import RingBuffer
 from twirl_mjx.sim.robots import ROBOTS
@@ -159,6 +161,8 @@ class Run:
             "robot": ROBOTS.reference(self.config.robot) or self.config.robot,
             "evaluation": means,
         }
+        if isinstance(self.config.droq, DroqConfig):  # what ``auto`` meant on this machine
+            card["form"] = forms.name_of(self.config.droq)
         if self.progress["refilled"]:
             card["replay_refilled_at"] = self.progress["refilled"]
         header = make_header(self.config, self._env, card)

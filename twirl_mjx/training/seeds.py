@@ -92,10 +92,32 @@ def batch_epoch(
     own_sources: bool = False,
     guide: Guide | None = None,
 ) -> Callable[[TrainState], tuple[TrainState, Metrics]]:
-    """Return ``train_epoch`` of a batch of seeds, not compiled; metrics are [S] each."""
+    """Return ``train_epoch`` of a batch of seeds, not compiled; metrics are [S] each.
+
+    A batch of one is the program of a run alone between two changes of shape: a batch axis would
+    make conditionals compute both of their branches.
+    """
     epoch = functools.partial(single.train_epoch, config, env, guide=guide)
     axes = per_field(0, None, own_sources=own_sources)
-    return jax.vmap(epoch, in_axes=(axes,), out_axes=(axes, 0))
+    batched = jax.vmap(epoch, in_axes=(axes,), out_axes=(axes, 0))
+
+    def run(states: TrainState) -> tuple[TrainState, Metrics]:
+        if num_seeds(states) > 1:
+            return batched(states)
+        after, metrics = epoch(_each(lambda leaf: leaf[0], axes, states))
+        one = _each(lambda leaf: leaf[None], axes, after)
+        return one, jax.tree.map(lambda value: value[None], metrics)
+
+    return run
+
+
+def _each(change: Callable[[jax.Array], jax.Array], axes: TrainState, states: Any) -> Any:
+    """Return a state with every leaf changed that ``axes`` gives a batch axis."""
+
+    def at(axis: int | None, subtree: Any) -> Any:
+        return subtree if axis is None else jax.tree.map(change, subtree)
+
+    return jax.tree.map(at, axes, states, is_leaf=lambda axis: axis is None)
 
 
 def compile_epoch_seeds(
@@ -137,12 +159,9 @@ def seed_state(states: TrainState, index: int) -> TrainState:
     if not 0 <= index < num_seeds(states):
         raise ValueError(f"seed index {index} is outside [0, {num_seeds(states) - 1}]")
 
-    def pick(axis: int | None, subtree: Any) -> Any:
-        return subtree if axis is None else jax.tree.map(lambda leaf: leaf[index], subtree)
-
     source = states.replay.source
     axes = per_field(0, None, own_sources=source is not None and source.rows.ndim == 3)
-    return jax.tree.map(pick, axes, states, is_leaf=lambda axis: axis is None)
+    return _each(lambda leaf: leaf[index], axes, states)
 
 
 def stack_states(states: Sequence[TrainState]) -> TrainState:

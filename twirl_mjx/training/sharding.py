@@ -7,6 +7,7 @@ compiler gathers the new transitions into each of them.
 
 from __future__ import annotations
 
+import contextlib
 import functools
 from collections.abc import Callable
 from typing import Any
@@ -15,8 +16,10 @@ import jax
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
+from twirl_mjx.machine import usable_cores
 from twirl_mjx.training import seeds
 from twirl_mjx.training.config import TrainConfig
+from twirl_mjx.training.guidance import Guide
 from twirl_mjx.training.state import TrainState, train_epoch
 from twirl_mjx.types import Metrics
 from twirl_mjx.worlds.vector import EnvState, VectorEnv
@@ -28,13 +31,57 @@ SEEDS = "seeds"
 WORLDS = "worlds"
 
 
-def device_mesh(axis: str) -> Mesh:
-    """Return all devices of the default backend in a row called ``axis``."""
-    return Mesh(np.asarray(jax.devices()), (axis,))
+def device_mesh(axis: str, count: int | None = None) -> Mesh:
+    """Return ``count`` devices of the default backend (all of them) in a row called ``axis``."""
+    return Mesh(np.asarray(jax.devices()[:count]), (axis,))
+
+
+def make_cpu_devices(num_seeds: int) -> None:
+    """Ask jax for several CPU devices, so that the seeds of a batch train side by side on cores.
+
+    To jax a CPU is one device whatever its cores, and then the products of a batch of seeds are
+    computed one after another by all of them, which small ones are not worth. Does nothing where
+    jax has computed something before, or where the number was set (``JAX_NUM_CPU_DEVICES=1``
+    keeps one).
+    """
+    if jax.config.jax_num_cpu_devices >= 0:
+        return
+    with contextlib.suppress(RuntimeError):  # its devices are fixed by now
+        jax.config.update("jax_num_cpu_devices", num_cpu_devices(num_seeds, len(usable_cores())))
+
+
+def num_cpu_devices(num_seeds: int, cores: int) -> int:
+    """Return how many CPU devices a batch of seeds gets: each has equally many seeds.
+
+    As many as fill the cores, with less than two devices for a core (three seeds on two cores
+    are faster on three devices than on one, four are slower on four than on two); else as many as
+    there are cores for.
+    """
+    even = [n for n in range(1, num_seeds + 1) if num_seeds % n == 0]
+    filling = [n for n in even if min(num_seeds, cores) <= n < 2 * cores]
+    return min(filling) if filling else max(n for n in even if n <= cores)
+
+
+def devices_for(num_seeds: int) -> int:
+    """Return the largest number of devices that are there and among which seeds divide evenly."""
+    return max(n for n in range(1, jax.device_count() + 1) if num_seeds % n == 0)
+
+
+def worlds_pay() -> bool:
+    """Return whether the worlds of one run are worth several devices, which CPU devices are not.
+
+    C MuJoCo steps them with threads on all cores, and every device repeats the learner's work.
+    """
+    return jax.default_backend() != "cpu"
 
 
 def spread_seeds(
-    config: TrainConfig, env: VectorEnv, mesh: Mesh, *, own_sources: bool = False
+    config: TrainConfig,
+    env: VectorEnv,
+    mesh: Mesh,
+    *,
+    own_sources: bool = False,
+    guide: Guide | None = None,
 ) -> tuple[Epoch, Place]:
     """Return the epoch of a batch of seeds on the devices of a mesh, and what puts it there.
 
@@ -43,6 +90,7 @@ def spread_seeds(
         env: The worlds of one seed.
         mesh: Devices, with the axis ``SEEDS``.
         own_sources: Whether every seed has a source ring of its own.
+        guide: Who else acts, one for all seeds, or None.
 
     Returns:
         The jitted epoch, which donates its argument, and a function that spreads a state evenly;
@@ -50,7 +98,7 @@ def spread_seeds(
     """
     specs = seeds.per_field(PartitionSpec(SEEDS), _EVERYWHERE, own_sources=own_sources)
     epoch = jax.shard_map(
-        seeds.batch_epoch(config, env, own_sources=own_sources),
+        seeds.batch_epoch(config, env, own_sources=own_sources, guide=guide),
         mesh=mesh,
         in_specs=(specs,),
         out_specs=(specs, PartitionSpec(SEEDS)),
