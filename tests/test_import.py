@@ -83,10 +83,11 @@ def test_asset_path_stays_inside(bad: str) -> None:
         assets.asset_path(bad)
 
 
-_HEAVY = """
+HEAVY = ("jax", "mujoco", "flax", "optax", "orbax", "scipy", "matplotlib", "onnx", "ray")
+_IMPORTS = """
 import contextlib, io, sys
 from twirl_mjx import cli
-heavy = ("jax", "mujoco", "flax", "optax", "orbax", "scipy", "matplotlib", "onnx", "ray")
+heavy = {heavy!r}
 for line in {lines!r}:
     before = set(sys.modules)
     with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
@@ -96,10 +97,10 @@ for line in {lines!r}:
 """
 
 
-def heavy_imports(lines: list[str]) -> list[str]:
+def heavy_imports(lines: list[str], heavy: tuple[str, ...] = HEAVY) -> list[str]:
     """Return, for each command line, which heavy packages it was the first to import."""
     result = subprocess.run(
-        [sys.executable, "-c", _HEAVY.format(lines=lines)],
+        [sys.executable, "-c", _IMPORTS.format(lines=lines, heavy=heavy)],
         env={**os.environ, "PYTHONPATH": str(Path(assets.__file__).parents[1])},
         capture_output=True,
         text=True,
@@ -120,6 +121,11 @@ def test_help_and_refusals_of_every_command_import_nothing_heavy(tmp_path: Path)
     lines += ["train --task bipd", "train --num-envs 0", "evaluate zero --shifts icey", "hlep",
               f"runs --runs {tmp_path}", f"runs --runs {tmp_path} --status finished"]  # fmt: skip
     assert heavy_imports(lines) == [f"{line} []" for line in lines]
+
+
+def test_help_and_a_typo_of_train_are_answered_without_numpy() -> None:
+    lines = ["train --help", "train --tsk biped"]
+    assert heavy_imports(lines, (*HEAVY, "numpy")) == [f"{line} []" for line in lines]
 
 
 def test_heavy_imports_are_noticed() -> None:

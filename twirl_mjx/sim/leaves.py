@@ -14,10 +14,13 @@ from collections.abc import Callable, Mapping
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
-import numpy as np
+from etils import epy
 
 from twirl_mjx.checks import check_choice, check_range
 from twirl_mjx.plugins import Registry
+
+with epy.lazy_imports():  # needed by worlds, not by options
+    import numpy as np
 
 if TYPE_CHECKING:
     from twirl_mjx.sim.scene import Scene

@@ -12,12 +12,17 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
-from numpy.typing import ArrayLike
+from etils import epy
 
 from twirl_mjx.checks import check_choice, check_range
+
+with epy.lazy_imports():  # needed by robots, not by options
+    import numpy as np
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
 
 LEG_JOINTS = ("hip", "thigh", "calf")
 NUM_LEGS = 4

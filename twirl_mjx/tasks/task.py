@@ -14,15 +14,14 @@ import dataclasses
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple
 
-import numpy as np
-
-from twirl_mjx.sim.robot import Robot
-from twirl_mjx.sim.robots import DEFAULT_ROBOT
+from twirl_mjx.sim.robots import DEFAULT_ROBOT, ROBOTS
 
 if TYPE_CHECKING:
     import jax
+    import numpy as np
 
     from twirl_mjx.sim.dynamics import Dynamics
+    from twirl_mjx.sim.robot import Robot
     from twirl_mjx.sim.scene import CollisionSet, Scene
     from twirl_mjx.tasks.base import Outcome, Start, View, World
     from twirl_mjx.tasks.observations import Observer
@@ -108,7 +107,7 @@ class Task[O]:
         self,
         options: O | None = None,
         *,
-        robot: Robot = DEFAULT_ROBOT,
+        robot: Robot | None = None,
         fixed_course: bool = False,
         episode_length: int = 400,
     ) -> None:
@@ -116,7 +115,7 @@ class Task[O]:
 
         Args:
             options: Of the task's own ``Options``; its defaults when not given.
-            robot: Whose observations it shows; its scene holds the same robot.
+            robot: Whose observations it shows, the A1's when not given; its scene holds the same.
             fixed_course: Whether goals and hurdles stand at fixed places (dynamics shifts).
             episode_length: Control steps of the longest episode.
 
@@ -126,7 +125,7 @@ class Task[O]:
         options = self.Options() if options is None else options
         self.check_options(options)
         self.options: O = options  # type: ignore[assignment]
-        self.robot = robot
+        self.robot = ROBOTS.get(DEFAULT_ROBOT) if robot is None else robot
         self.fixed_course = fixed_course
         self.episode_length = episode_length
         self.observer = self.make_observer()
@@ -154,6 +153,8 @@ class Task[O]:
 
     def bands(self, state: Any) -> np.ndarray:
         """Return the world x [H] in m of hurdle bands to draw, given one world's task state."""
+        import numpy as np  # needed by films, not by options
+
         del state
         return np.zeros(0)
 

@@ -53,7 +53,7 @@ class WorldConfig:
     """Name of the task, or file.py:Name of your own."""
     options: Any = None
     """Options of the task, of its own kind; the defaults when not given."""
-    robot: str = DEFAULT_ROBOT.name
+    robot: str = DEFAULT_ROBOT
     """Name of the robot, or file.py:NAME of your own."""
     shift: str = "none"
     """Dynamics shift, by name, or file.py:NAME of your own."""

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from twirl_mjx.plugins import Registry
 from twirl_mjx.sim.robot import Robot
-from twirl_mjx.sim.robots.a1 import A1
+
+if TYPE_CHECKING:
+    from twirl_mjx.sim.robots.a1 import A1 as A1
 
 __all__ = ["A1", "DEFAULT_ROBOT", "ROBOTS", "get_robot", "register_robot"]
 
@@ -17,11 +19,23 @@ def _accept(item: Any) -> Robot:
     return item
 
 
-ROBOTS: Registry[Robot] = Registry("robot", accept=_accept, group="twirl_mjx.robots")
+ROBOTS: Registry[Robot] = Registry(
+    "robot",
+    accept=_accept,
+    group="twirl_mjx.robots",
+    shipped={"a1": "twirl_mjx.sim.robots.a1:A1"},
+)
 """The one list of robots."""
 
 register_robot = ROBOTS.register
 get_robot = ROBOTS.get
 
-DEFAULT_ROBOT = register_robot(A1)
-"""The robot of the paper."""
+DEFAULT_ROBOT = "a1"
+"""Name of the robot of the paper."""
+
+
+def __getattr__(name: str) -> Any:
+    """Return the A1 when it is first asked for: its arrays need numpy, which options do not."""
+    if name == "A1":
+        return get_robot("a1")
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
