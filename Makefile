@@ -19,8 +19,8 @@ CASE = $(call option,task,TASK) $(call option,shift,SHIFT) $(call option,seed,SE
 
 .PHONY: help setup bench-setup gpu-setup lint format test test-slow test-gpu test-jax-oldest \
 	test-faults fuzz audit \
-	gpu-counts gpu-proof train evaluate collect sweep figures report render view demo bench \
-	curriculum web docs dist clean
+	gpu-counts gpu-proof train evaluate collect sweep figures report render view export runs \
+	demo bench curriculum web docs dist clean
 
 help: ## show this table
 	@echo 'usage: make TARGET [TASK=..] [SHIFT=..] [SEED=..] [RUN=..] [GRID=..] [ARGS=".."]'
@@ -98,6 +98,12 @@ render: setup ## film RUN=runs/NAME as mp4 and a strip of frames
 
 view: setup ## watch RUN= (or the shipped biped) in a browser (ARGS="--html replay.html")
 	$(TWIRL) view $(RUNS) $(ARGS)
+
+export: setup ## write RUN= as an ONNX file, with a contract that says how it meets its robot
+	$(TWIRL) export $(RUNS) $(ARGS)
+
+runs: setup ## list runs (ARGS="compare A B", "show A", "prune")
+	$(TWIRL) runs $(ARGS)
 
 demo: setup ## render and evaluate the shipped policies; trains nothing
 	$(TWIRL) demo $(ARGS)

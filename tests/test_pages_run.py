@@ -243,6 +243,9 @@ SHORT = "--preset debug"
 BRIEF = {
     r"make demo$": 'make demo ARGS="--episodes 1 --no-film"',
     r"make train TASK=biped$": f'make train TASK=biped ARGS="{SHORT} --name biped-twirl-cpu-s0"',
+    r"make train TASK=examples/trot.py:Trot$": f"make train TASK=examples/trot.py:Trot"
+    f' ARGS="{SHORT}"',
+    r"make view$": 'make view ARGS="--seconds 1 --html live.html --overwrite"',
     r"make test$": 'make test ARGS="-n 0 -q tests/test_links.py"',
     r"make lint$": ".venv/bin/ruff check -q .",
     r"make figures$": 'make figures ARGS="--no-pictures"',

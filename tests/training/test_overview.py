@@ -200,7 +200,7 @@ def test_show_and_compare(tmp_path: Path, capsys: pytest.CaptureFixture[str]) ->
     }
     assert rows["droq.utd"] == ["0.5", "1.0"]
     assert "droq.batch_size" not in rows
-    with pytest.raises(ValueError, match="1 run to compare"):
+    with pytest.raises(ValueError, match="found 1 of the runs to compare"):
         command.main(["compare", "a", "--runs", str(tmp_path)])
     with pytest.raises(ValueError, match="'\\*' matches 2 runs, expected one: a, b"):
         command.main(["show", "*", "--runs", str(tmp_path)])

@@ -186,7 +186,10 @@ def _compare(argv: list[str]) -> int:
     options = parse(CompareOptions, argv, "twirl runs compare")
     found = [overview.look(path) for path in overview.find(options.runs, options.names)]
     if len(found) < 2:
-        raise ValueError(f"{len(found)} run to compare, expected two or more")
+        raise ValueError(
+            f"found {len(found)} of the runs to compare in {options.runs}/, expected two or more"
+            " (`twirl runs` lists what is there)"
+        )
     table = Table(box=None, pad_edge=False)
     table.add_column("", overflow="fold")
     for run in found:
