@@ -10,6 +10,7 @@ import contextlib
 import dataclasses
 import json
 import subprocess
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -97,8 +98,19 @@ def make_learner(options: LearnerBench, seeds: int) -> tuple[Chain, int]:
         return Chain(jax.vmap(run), state, online), work
     mesh = sharding.device_mesh(sharding.SEEDS, devices)
     spec = PartitionSpec(sharding.SEEDS)
-    spread = jax.shard_map(jax.vmap(run), mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False)
+    local = _alone(run) if devices == seeds else jax.vmap(run)  # as seeds.batch_epoch does
+    spread = jax.shard_map(local, mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False)
     return Chain(spread, *jax.device_put((state, online), NamedSharding(mesh, spec))), work
+
+
+def _alone(run: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
+    """Return ``run`` for a batch of one, without a batch axis inside."""
+
+    def of_one(carry: Any, online: Any) -> Any:
+        carry, online = jax.tree.map(lambda leaf: leaf[0], (carry, online))
+        return jax.tree.map(lambda leaf: leaf[None], run(carry, online))
+
+    return of_one
 
 
 def make_bound(options: LearnerBench, layout: matmuls.Layout) -> tuple[Chain, int]:
