@@ -95,7 +95,7 @@ class Biped(Task[BipedOptions]):
         ),
         "cosine": STANDING_MEASURES["cosine"],
     }
-    lead = ("return", "standing_time", "on_feet", "success")
+    lead = ("standing_time", "return", "on_feet", "success")
     aim = "goal_time"
     chain = (
         Link("stand", {"task": "stand"}),

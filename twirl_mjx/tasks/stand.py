@@ -77,7 +77,7 @@ class Stand(Task[StandOptions]):
     Options = StandOptions
     collision = "feet"
     measures = STANDING_MEASURES
-    lead = ("return", "standing_time", "on_feet")
+    lead = ("standing_time", "return", "on_feet")
     presets = {
         "paper": {"stand.height_of": "front_feet"},
         "cpu": {"stand.risen_fraction": 0.9, "episode_length": 100},
