@@ -33,8 +33,11 @@ PAGES = [
 FENCE = re.compile(r"^ *```(\w*)[^\n]*\n(.*?)^ *```", re.M | re.S)
 INLINE = re.compile(r"(?<!`)`([^`]+)`(?!`)")
 COMMAND = re.compile(r"(?:\.venv/bin/)?(?:twirl|make) [a-z]")
-PLACEHOLDER = re.compile(r"\.\.\.|…|\b[A-Z]{2,}\b(?!=)|=\.\.|[$\[{<|>]|\bmy[_.]|/mine\b|\bX\b")
-"""What stands for something else: `make render RUN=runs/NAME`, `twirl sweep my_grid.py`."""
+PLACEHOLDER = re.compile(
+    r"\.\.\.|…|\b[A-Z]{2,}\b(?!=)|=\.\.|=k\b|[$\[{<|>]|\bmy[_.]|/mine\b|\bX\b|\bgo1\.py\b"
+)
+"""What stands for something else: `make render RUN=runs/NAME`, `twirl sweep my_grid.py`; or needs a
+file that is not here: `examples/go1.py` reads the MJCF of another package."""
 
 
 def blocks(page: Path, *languages: str) -> Iterator[str]:
@@ -268,7 +271,7 @@ LEFT_OUT = {
     r"make web": "tests/view/test_web.py does it",
     r".*http\.server": "serves until it is stopped",
     r".*downloaded\.onnx": "a file of the reader's",
-    r"T=|.*train \$T": "hours of runs that made a shipped policy",
+    r"(T|MILD)=|.*train \$T": "hours of runs that made a shipped policy",
     r"make gpu|make test-gpu": "needs a GPU, or gigabytes",
 }
 """Lines that are not run -> why."""
