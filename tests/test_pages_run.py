@@ -140,6 +140,7 @@ SHORTER = {
     "num_envs=256": "num_envs=2",
     "num_envs=64": "num_envs=2",
     '"runs/biped-twirl-cpu-s0"': "POLICY",
+    '"assets/policies/biped.npz"': "POLICY",
 }
 """Parts of the pages' Python that would take long, or need a run, and what stands for them."""
 GIVEN = """
@@ -272,6 +273,7 @@ LEFT_OUT = {
     r".*http\.server": "serves until it is stopped",
     r".*downloaded\.onnx": "a file of the reader's",
     r"(T|MILD)=|.*train \$T": "hours of runs that made a shipped policy",
+    r"twirl curriculum --target": "hours; tests/sweep/test_contest.py has a short one",
     r"make gpu|make test-gpu": "needs a GPU, or gigabytes",
 }
 """Lines that are not run -> why."""
