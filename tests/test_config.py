@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from twirl_mjx import records
+from twirl_mjx import machine, records
 from twirl_mjx.droq.config import DroqConfig
 from twirl_mjx.policies.resolve import SCRIPTED_SOURCES
 from twirl_mjx.replay.config import ReplayConfig
@@ -33,6 +33,24 @@ def test_every_preset_builds_and_gives_whole_updates(task: str, preset: str) -> 
     assert config.variant == ("twirl" if sourced else "scratch")
     assert make_config(task, preset) == config
     hash(config)
+
+
+@pytest.mark.parametrize(
+    ("preset", "cpu_has", "accelerator", "dtype"),
+    [
+        ("cpu", True, False, "bfloat16"),
+        ("cpu", True, True, "float32"),
+        ("cpu", False, False, "float32"),
+        ("paper", True, False, "float32"),
+        ("debug", True, False, "float32"),
+    ],
+)
+def test_the_cpu_preset_multiplies_as_the_machine_does_fastest(
+    monkeypatch: pytest.MonkeyPatch, preset: str, cpu_has: bool, accelerator: bool, dtype: str
+) -> None:
+    monkeypatch.setattr(machine, "multiplies_bfloat16", lambda: cpu_has)
+    monkeypatch.setattr(machine, "may_have_accelerator", lambda: accelerator)
+    assert make_config("biped", preset).droq.matmul_dtype == dtype
 
 
 def test_paper_preset_has_the_numbers_of_table_4() -> None:

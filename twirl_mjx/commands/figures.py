@@ -23,7 +23,11 @@ class FiguresOptions:
     """Folder of the few that pages show: a picture of the same name is replaced by the new one."""
     quotes: Path = Path("experiments/quotes")
     """Folder of the templates of what pages quote (docs/figures.md)."""
-    pages: tuple[Path, ...] = (Path("README.md"), Path("docs/results.md"))
+    pages: tuple[Path, ...] = (
+        Path("README.md"),
+        Path("docs/results.md"),
+        Path("docs/performance_learner.md"),
+    )
     """Pages whose blocks are written anew; one that is not there is left out."""
     pictures: bool = True
     """Whether to draw; --no-pictures writes the pages alone."""

@@ -72,6 +72,15 @@ def default_preset() -> str:
     return "cpu" if jax.default_backend() == "cpu" else "paper"
 
 
+def _of_machine(preset: str) -> dict[str, Any]:
+    """Return what a preset holds on this machine only: bfloat16 products where the CPU has them.
+
+    They are faster there, and training is not worse (docs/performance_learner.md).
+    """
+    fits = preset == "cpu" and machine.multiplies_bfloat16() and not machine.may_have_accelerator()
+    return {"droq.matmul_dtype": "bfloat16"} if fits else {}
+
+
 def make_config(
     task: str, preset: str = "paper", learner: str = TrainConfig.learner
 ) -> TrainConfig:
@@ -96,7 +105,7 @@ def make_config(
         source = make_config(kind.source, preset, learner)
         config = settle(config, {f"{kind.source}.{k}": v for k, v in vars(source.options).items()})
     own = dict(kind.presets.get("paper", {})) | dict(kind.presets.get(preset, {}))
-    settings = dict(SETTINGS[preset]) | own
+    settings = dict(SETTINGS[preset]) | _of_machine(preset) | own
     if config.learner != TrainConfig.learner:
         settings = _of_learner(config, settings)
     return settle(config, settings)
