@@ -38,8 +38,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from twirl_mjx import machine
-from twirl_mjx.training import source_rules
+from twirl_mjx.training import presets, source_rules
 from twirl_mjx.types import Transition
 
 
@@ -62,7 +61,7 @@ class TraceCounter:
 @pytest.fixture(autouse=True)
 def same_presets_on_every_cpu(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let presets hold what they do where a CPU has no instructions for bfloat16."""
-    monkeypatch.setattr(machine, "multiplies_bfloat16", lambda: False)
+    monkeypatch.setattr(presets, "multiplies_bfloat16", lambda: False)
 
 
 @pytest.fixture

@@ -17,9 +17,9 @@ from twirl_mjx.tasks.biped import BipedOptions
 from twirl_mjx.tasks.hurdles import HurdlesOptions
 from twirl_mjx.tasks.imitate import ImitateOptions
 from twirl_mjx.tasks.registry import TASKS
-from twirl_mjx.training import config_json
+from twirl_mjx.training import config_json, presets
 from twirl_mjx.training.config import EvalConfig, TrainConfig
-from twirl_mjx.training.presets import PRESETS, make_config
+from twirl_mjx.training.presets import PRESETS, make_config, multiplies_bfloat16
 
 
 @pytest.mark.parametrize("task", TASKS.names())
@@ -36,6 +36,19 @@ def test_every_preset_builds_and_gives_whole_updates(task: str, preset: str) -> 
 
 
 @pytest.mark.parametrize(
+    ("flags", "has"), [("fpu avx2 avx512_bf16 amx", True), ("fpu avx2", False), (None, False)]
+)
+def test_instructions_for_bfloat16(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, flags: str | None, has: bool
+) -> None:
+    path = tmp_path / "cpuinfo"
+    if flags is not None:
+        path.write_text(f"processor : 0\nflags : {flags}\nbugs :\n")
+    monkeypatch.setattr(presets, "CPU_FLAGS", path)
+    assert multiplies_bfloat16.__wrapped__() is has
+
+
+@pytest.mark.parametrize(
     ("preset", "cpu_has", "accelerator", "dtype"),
     [
         ("cpu", True, False, "bfloat16"),
@@ -48,7 +61,7 @@ def test_every_preset_builds_and_gives_whole_updates(task: str, preset: str) -> 
 def test_the_cpu_preset_multiplies_as_the_machine_does_fastest(
     monkeypatch: pytest.MonkeyPatch, preset: str, cpu_has: bool, accelerator: bool, dtype: str
 ) -> None:
-    monkeypatch.setattr(machine, "multiplies_bfloat16", lambda: cpu_has)
+    monkeypatch.setattr(presets, "multiplies_bfloat16", lambda: cpu_has)
     monkeypatch.setattr(machine, "may_have_accelerator", lambda: accelerator)
     assert make_config("biped", preset).droq.matmul_dtype == dtype
 

@@ -10,7 +10,6 @@ from pathlib import Path
 import pytest
 
 from twirl_mjx import cli, machine
-from twirl_mjx.machine import multiplies_bfloat16
 
 
 def test_windows_is_sent_to_wsl_in_one_line(
@@ -29,19 +28,6 @@ def test_cores_without_affinity(monkeypatch: pytest.MonkeyPatch) -> None:
     assert set(machine.usable_cores()) == os.sched_getaffinity(0)
     monkeypatch.delattr(os, "sched_getaffinity")  # macOS
     assert machine.usable_cores() == list(range(os.cpu_count() or 1))
-
-
-@pytest.mark.parametrize(
-    ("flags", "has"), [("fpu avx2 avx512_bf16 amx", True), ("fpu avx2", False), (None, False)]
-)
-def test_instructions_for_bfloat16(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, flags: str | None, has: bool
-) -> None:
-    path = tmp_path / "cpuinfo"
-    if flags is not None:
-        path.write_text(f"processor : 0\nflags : {flags}\nbugs :\n")
-    monkeypatch.setattr(machine, "CPU_FLAGS", path)
-    assert multiplies_bfloat16.__wrapped__() is has
 
 
 def test_locks_exclude_and_are_released_with_the_file(tmp_path: Path) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import functools
 import importlib.util
 import os
 import stat
@@ -16,8 +15,6 @@ UNSUPPORTED = (
     "Windows has not what this needs (process locks and signals): run it in WSL, the Linux that"
     " Windows brings (`wsl --install`)"
 )
-CPU_FLAGS = Path("/proc/cpuinfo")
-"""What Linux knows of the CPU."""
 CAN_PIN = hasattr(os, "sched_setaffinity")
 """Whether a process can be bound to cores here."""
 
@@ -78,19 +75,6 @@ def may_have_accelerator() -> bool:
     from importlib.metadata import entry_points  # takes a while to import
 
     return bool(entry_points(group="jax_plugins"))
-
-
-@functools.cache
-def multiplies_bfloat16() -> bool:
-    """Return whether the CPU has instructions for products of bfloat16 (``avx512_bf16``).
-
-    Linux says so in ``/proc/cpuinfo``; elsewhere nobody has measured whether they help.
-    """
-    try:
-        text = CPU_FLAGS.read_text(encoding="utf-8", errors="replace")
-    except OSError:
-        return False
-    return "avx512_bf16" in text.split()
 
 
 def try_lock(file: TextIO, *, shared: bool = False) -> bool:

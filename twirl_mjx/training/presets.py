@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
-from twirl_mjx import machine
+from twirl_mjx import files, machine
 from twirl_mjx.checks import check_choice
 from twirl_mjx.tasks.registry import TASKS
 from twirl_mjx.training.config import TrainConfig
@@ -62,6 +64,9 @@ SETTINGS: dict[str, Mapping[str, Any]] = {
 """Preset -> what departs from the defaults in every task; tasks have more (``Task.presets``)."""
 PRESETS = tuple(SETTINGS)
 
+CPU_FLAGS = Path("/proc/cpuinfo")
+"""What Linux knows of the CPU."""
+
 
 def default_preset() -> str:
     """Return ``paper`` where jax has an accelerator, else ``cpu``."""
@@ -72,12 +77,25 @@ def default_preset() -> str:
     return "cpu" if jax.default_backend() == "cpu" else "paper"
 
 
+@functools.cache
+def multiplies_bfloat16() -> bool:
+    """Return whether the CPU has instructions for products of bfloat16 (``avx512_bf16``).
+
+    Linux says so in ``/proc/cpuinfo``; elsewhere nobody has measured whether they help.
+    """
+    try:
+        text = files.read_text(CPU_FLAGS, "what Linux knows of the CPU")
+    except (OSError, ValueError):
+        return False
+    return "avx512_bf16" in text.split()
+
+
 def _of_machine(preset: str) -> dict[str, Any]:
     """Return what a preset holds on this machine only: bfloat16 products where the CPU has them.
 
     They are faster there, and training is not worse (docs/performance_learner.md).
     """
-    fits = preset == "cpu" and machine.multiplies_bfloat16() and not machine.may_have_accelerator()
+    fits = preset == "cpu" and multiplies_bfloat16() and not machine.may_have_accelerator()
     return {"droq.matmul_dtype": "bfloat16"} if fits else {}
 
 
