@@ -115,6 +115,27 @@ def test_two_checkpoints_and_their_rows_are_kept(saved: Path, fresh: TrainState)
     np.testing.assert_array_equal(load_replay(saved, CAPACITY)[:, 0], np.arange(80, 160))
 
 
+def test_going_back_to_a_damaged_checkpoint_deletes_nothing(
+    saved: Path, fresh: TrainState, tmp_path: Path
+) -> None:
+    """The newest that all seeds of a batch have is damaged in one: its own newer one is kept."""
+    run_dir = tmp_path / "run"
+    shutil.copytree(saved, run_dir)
+    root = run_dir / "checkpoints"
+    state_file = next(name for name in sorted(files_of(saved, 128)) if "/train_state/d/" in name)
+    flip(root / state_file)
+    checkpoints = Checkpoints(run_dir)
+    with pytest.raises(DamagedError, match=r"128 transitions.*nothing was deleted.*alone.*160"):
+        checkpoints.back_to(128)
+    checkpoints.close()
+    assert restore(run_dir, fresh) == (160, None)
+    (root / state_file).write_bytes((saved / "checkpoints" / state_file).read_bytes())
+    checkpoints = Checkpoints(run_dir)
+    checkpoints.back_to(128)
+    checkpoints.close()
+    assert restore(run_dir, fresh) == (128, None)
+
+
 @pytest.mark.parametrize("damage", DAMAGES)
 def test_a_damaged_checkpoint_is_stepped_over(
     damage: str, saved: Path, fresh: TrainState, tmp_path: Path

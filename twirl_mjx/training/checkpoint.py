@@ -121,10 +121,28 @@ class Checkpoints:
         """Return the env steps of the newest checkpoint, None without one."""
         return newest_checkpoint(self._run_dir)
 
-    def back_to(self, step: int) -> None:
-        """Delete the checkpoints after ``step``, which is one of them."""
-        for later in reversed([kept for kept in manifests.visible(self._root) if kept > step]):
-            self._delete(later)
+    def back_to(self, step: int, *, rows: bool = True) -> None:
+        """Delete the checkpoints after ``step``, which is one of them.
+
+        Args:
+            step: Env steps at which the run goes on, because others have nothing newer.
+            rows: Whether the rows of the replay have to be whole, too.
+
+        Raises:
+            DamagedError: There are later ones, and none up to ``step`` is whole; all are kept.
+        """
+        steps = manifests.visible(self._root)
+        later = [kept for kept in steps if kept > step]
+        if later and not any(
+            manifests.is_whole(self._root, kept, rows=rows) for kept in steps if kept <= step
+        ):
+            raise DamagedError(
+                f"{self._run_dir}: its checkpoint at {step:,} transitions, the newest that all runs"
+                f" have, is damaged; nothing was deleted (nearest: train it alone, from"
+                f" {later[-1]:,})"
+            )
+        for newer in reversed(later):
+            self._delete(newer)
 
     def save(self, state: TrainState, progress: dict[str, Any]) -> None:
         """Write a checkpoint; a second save at the same env steps does nothing.

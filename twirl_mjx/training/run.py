@@ -113,8 +113,12 @@ class Run:
         )
 
     def restore(self, template: TrainState, step: int, refill: Refill) -> TrainState:
-        """Return the checkpoint at ``step``; later ones are deleted."""
-        self.checkpoints.back_to(step)
+        """Return the checkpoint at ``step``; later ones are deleted.
+
+        Raises:
+            DamagedError: None up to it is whole.
+        """
+        self.checkpoints.back_to(step, rows=not self.config.refill)
         state, progress = self.checkpoints.restore(template, refill if self.config.refill else None)
         self.resumed_at = int(state.env_steps)
         self.progress |= progress
