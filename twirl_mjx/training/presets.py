@@ -93,7 +93,7 @@ def multiplies_bfloat16() -> bool:
 def _of_machine(preset: str) -> dict[str, Any]:
     """Return what a preset holds on this machine only: bfloat16 products where the CPU has them.
 
-    They are faster there, and training is not worse (docs/performance_learner.md).
+    They are faster there, and training was not seen to be worse (docs/performance_learner.md).
     """
     fits = preset == "cpu" and multiplies_bfloat16() and not machine.may_have_accelerator()
     return {"droq.matmul_dtype": "bfloat16"} if fits else {}

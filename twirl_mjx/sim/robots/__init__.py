@@ -19,23 +19,23 @@ def _accept(item: Any) -> Robot:
     return item
 
 
+DEFAULT_ROBOT = "a1"
+"""Name of the robot of the paper."""
+
 ROBOTS: Registry[Robot] = Registry(
     "robot",
     accept=_accept,
     group="twirl_mjx.robots",
-    shipped={"a1": "twirl_mjx.sim.robots.a1:A1"},
+    shipped={DEFAULT_ROBOT: "twirl_mjx.sim.robots.a1:A1"},
 )
 """The one list of robots."""
 
 register_robot = ROBOTS.register
 get_robot = ROBOTS.get
 
-DEFAULT_ROBOT = "a1"
-"""Name of the robot of the paper."""
-
 
 def __getattr__(name: str) -> Any:
     """Return the A1 when it is first asked for: its arrays need numpy, which options do not."""
     if name == "A1":
-        return get_robot("a1")
+        return get_robot(DEFAULT_ROBOT)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
