@@ -5,7 +5,9 @@ MJX takes half a minute to compile, so one compiled function of three worlds ser
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from types import SimpleNamespace
 from typing import Any
 
@@ -248,6 +250,44 @@ def test_native_threads_and_vmap_change_nothing(flat: Scene, native_step: Step) 
         np.testing.assert_array_equal(threaded[index], expected[index])
         for seed in range(2):
             np.testing.assert_array_equal(getattr(trace, name)[seed], expected[index])
+
+
+def test_overlapping_calls_wait_for_none_and_keep_their_worlds(
+    flat: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Seeds on devices of their own step at once; their parameters are written once each."""
+    qpos, qvel, target = moving(0.001)
+    host_step, calls = engine.NativeEngine._host_step, []
+
+    def remember(self: engine.NativeEngine, *args: Any) -> np.ndarray:
+        calls.append(args)
+        return host_step(self, *args)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(engine.NativeEngine, "_host_step", remember)
+        step = make_step(flat, "native")
+        for worlds in (make_worlds(friction=[1.0, 0.4, 0.2]), make_worlds(gravity=[3.7, 5, 9])):
+            step(qpos, qvel, make_command(target), worlds)
+    alone = [host_step(engine.NativeEngine(flat, 1), *args) for args in calls]
+    assert np.abs(alone[0] - alone[1]).max() > 1e-3
+
+    both, written = threading.Barrier(2, timeout=60.0), []
+    write = engine.write_physics
+
+    def write_when_both_are_in_their_calls(*args: Any) -> None:
+        if len(written) < 2:
+            both.wait()
+        written.append(args)
+        write(*args)
+
+    monkeypatch.setattr(engine, "write_physics", write_when_both_are_in_their_calls)
+    native = engine.NativeEngine(flat, 1)
+    with ThreadPoolExecutor(2) as pool:
+        together = list(pool.map(lambda args: host_step(native, *args), calls))
+    assert len(written) == 2 * N
+    in_turn = [host_step(native, *args) for args in calls * 2]
+    assert len(written) == 2 * N
+    np.testing.assert_array_equal(together + in_turn, alone * 3)
 
 
 def settle(built: Scene, qpos: np.ndarray, worlds: Dynamics, steps: int = 12) -> np.ndarray:

@@ -212,6 +212,15 @@ def test_cpu_devices_fill_the_cores(num_seeds: int, on_1_2_4_16_cores: list[int]
     assert [sharding.num_cpu_devices(num_seeds, c) for c in (1, 2, 4, 16)] == on_1_2_4_16_cores
 
 
+@pytest.mark.parametrize(("devices", "threads"), [(1, 4), (2, 2), (3, 1), (8, 1)])
+def test_devices_share_the_cores_for_their_worlds(
+    devices: int, threads: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sharding, "usable_cores", lambda: [0, 1, 2, 3])
+    monkeypatch.setattr(sharding, "devices_for", lambda num_seeds: devices)
+    assert sharding.threads_for(24) == threads
+
+
 def test_a_number_of_cpu_devices_that_was_set_stays(monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[int] = []
     monkeypatch.setattr(jax.config, "update", lambda _, value: asked.append(value))

@@ -222,21 +222,21 @@ def silence() -> None:
 class NativeEngine:
     """C MuJoCo in host threads (``mujoco.rollout``), called from inside jitted code.
 
-    Each call starts the constraint solver cold, so that a step depends on nothing but its
-    arguments; the cached per-world models only save writing parameters that did not change.
+    Calls that overlap, of seeds on devices of their own, do not wait for each other: each takes an
+    idle stepper, or makes one.
     """
 
     def __init__(self, scene: Scene, threads: int) -> None:
-        """Keep the scene; threads and per-world models are created on the first step."""
+        """Keep the scene; threads and per-world models are created on the first step.
+
+        Args:
+            scene: The compiled scene.
+            threads: Of one call.
+        """
         self._scene = scene
         self._threads = threads
+        self._idle: list[_Stepper] = []
         self._lock = threading.Lock()
-        self._rollout: mujoco.rollout.Rollout | None = None
-        self._models: list[mujoco.MjModel] = []
-        self._layout: Layout = ()
-        self._slots: dict[str, int | slice] = {}
-        self._places: list[Target] = []
-        self._written = np.zeros((0, 0))
 
     def step(
         self, data: mjx.Data, command: MotorCommand, dynamics: Dynamics
@@ -272,32 +272,75 @@ class NativeEngine:
         # Leading axes are worlds, and seeds when the caller is vmapped over them.
         lead, size = np.shape(packed)[:-1], np.shape(packed)[-1]
         columns = np.asarray(packed, np.float64).reshape(-1, size)
-        model, n_substeps = self._scene.mj_model, self._scene.options.n_substeps
+        model = self._scene.mj_model
         state_at = size - model.nq - model.nv
         physics, target, state = np.split(columns, [state_at - target_size, state_at], axis=1)
+        stepper = self._take(physics)
+        try:
+            states = stepper.step(layout, physics, target, state)
+        finally:
+            self._idle.append(stepper)
+        return np.asarray(states, np.float32).reshape(*lead, *states.shape[1:])
+
+    def _take(self, physics: np.ndarray) -> _Stepper:
+        """Return a stepper that nobody uses, if there is one then that of these very worlds."""
         with self._lock:
-            models = self._prepare(layout, physics)
-            start = np.concatenate([np.zeros((len(state), 1)), state], axis=1)
-            assert self._rollout is not None
-            control = target.reshape(len(state), -1, model.nu)
-            out = np.empty((len(state), n_substeps, start.shape[1]))
-            self._rollout.rollout(
-                models,
-                self._data,
-                start,
-                np.repeat(control, n_substeps // control.shape[1], axis=1),
-                skip_checks=True,  # they cost a tenth of a step of 16 worlds
-                nstep=n_substeps,
-                state=out,
-            )
-        return np.asarray(out[..., 1:], np.float32).reshape(*lead, n_substeps, -1)
+            if not self._idle:
+                return _Stepper(self._scene, self._threads)
+            fits = (i for i, one in enumerate(self._idle) if one.has_written(physics))
+            return self._idle.pop(next(fits, -1))
+
+
+class _Stepper:
+    """One call at a time of ``mujoco.rollout``, with a model for each world.
+
+    Each call starts the constraint solver cold, so that a step depends on nothing but its
+    arguments; the models that are kept only save writing parameters that did not change.
+    """
+
+    def __init__(self, scene: Scene, threads: int) -> None:
+        silence()
+        self._scene = scene
+        self._rollout = mujoco.rollout.Rollout(nthread=threads)
+        self._data = [mujoco.MjData(scene.mj_model) for _ in range(threads)]
+        self._models: list[mujoco.MjModel] = []
+        self._layout: Layout = ()
+        self._slots: dict[str, int | slice] = {}
+        self._places: list[Target] = []
+        self._written = np.zeros((0, 0))
+
+    def has_written(self, physics: np.ndarray) -> bool:
+        """Return whether its models hold these parameters [N, P]."""
+        return np.array_equal(self._written, physics)
+
+    def step(
+        self, layout: Layout, physics: np.ndarray, target: np.ndarray, state: np.ndarray
+    ) -> np.ndarray:
+        """Return positions and velocities [N, S, nq + nv] after every physics step.
+
+        Args:
+            layout: What stands in a row of ``physics``.
+            physics: [N, P] parameters of the models.
+            target: [N, any] joint targets, of equal parts of the control step one after another.
+            state: [N, nq + nv].
+        """
+        n_substeps, nu = self._scene.options.n_substeps, self._scene.mj_model.nu
+        start = np.concatenate([np.zeros((len(state), 1)), state], axis=1)
+        control = target.reshape(len(state), -1, nu)
+        out = np.empty((len(state), n_substeps, start.shape[1]))
+        self._rollout.rollout(
+            self._prepare(layout, physics),
+            self._data,
+            start,
+            np.repeat(control, n_substeps // control.shape[1], axis=1),
+            skip_checks=True,  # they cost a tenth of a step of 16 worlds
+            nstep=n_substeps,
+            state=out,
+        )
+        return out[..., 1:]
 
     def _prepare(self, layout: Layout, physics: np.ndarray) -> list[mujoco.MjModel]:
         """Return one model per world holding its parameters ``physics`` [N, P]."""
-        if self._rollout is None:
-            silence()
-            self._rollout = mujoco.rollout.Rollout(nthread=self._threads)
-            self._data = [mujoco.MjData(self._scene.mj_model) for _ in range(self._threads)]
         if len(self._models) != len(physics) or self._layout != layout:
             self._models = [self._copy() for _ in physics]
             self._written = np.full(physics.shape, np.nan)

@@ -109,7 +109,7 @@ class Program:
         config = configs[0]
         self.num_seeds = len(configs)
         self._guide = guide
-        self.env = make_env(config)
+        self.env = make_env(config, threads=sharding.threads_for(self.num_seeds))
         self.evaluate = compile_evaluation(config, self.num_seeds)
         self._configs = configs
         self._counts_differ = len({each.effective_phi for each in configs}) > 1

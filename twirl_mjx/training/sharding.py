@@ -67,6 +67,11 @@ def devices_for(num_seeds: int) -> int:
     return max(n for n in range(1, jax.device_count() + 1) if num_seeds % n == 0)
 
 
+def threads_for(num_seeds: int) -> int:
+    """Return the host threads that step the worlds of one device: the devices share the cores."""
+    return max(1, len(usable_cores()) // devices_for(num_seeds))
+
+
 def worlds_pay() -> bool:
     """Return whether the worlds of one run are worth several devices, which CPU devices are not.
 
