@@ -245,13 +245,12 @@ def test_a_run_that_drops_too_much_fails_with_count_and_first_cause(
     try:
         states = batch.start()
         logger: Any = None  # all seeds fail, so nobody is told apart
-        batch.guard(states, logger)
+        batch.guard(states, np.array(True), states.inserted, logger)
         assert not batch.note_drops(np.array(0.0))
         assert batch.note_drops(np.array([4.0]))
         assert batch.note_drops(np.array(1.0))  # the first one stays the first
-        lost = states.replace(inserted=states.inserted - 2)
         with pytest.raises(guards.DivergedError, match=r"^2 of 96 .*because the reward was not"):
-            batch.guard(lost, logger)
+            batch.guard(states, np.array(True), states.inserted - 2, logger)
     finally:
         batch.close()
 
@@ -335,6 +334,8 @@ def test_diverged_learner_names_the_tensor(stand_config: TrainConfig, whole_run:
         actor=learner.actor | {"mean": learner.actor["mean"] | {"kernel": kernel}}
     )
     guards.check_finite(learner)
+    assert bool(guards.all_finite(learner))
+    assert not bool(guards.all_finite(broken))
     with pytest.raises(guards.DivergedError, match=r"actor\.mean\.kernel"):
         guards.check_finite(broken)
 

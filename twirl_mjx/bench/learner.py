@@ -39,7 +39,9 @@ from twirl_mjx.training import sharding
 ROWS = 50_000
 """Transitions in the replay, as in the SBX peer."""
 BLOCKS = 32
-"""Blocks of updates in one compiled call: an epoch of the preset ``cpu``, after which seeds meet."""
+"""Blocks of updates in one compiled call, after which seeds wait for each other.
+
+With few, that waiting is measured: an epoch of training is longer still."""
 
 
 def random_ring(options: LearnerBench, seeds: int) -> ring.RingBuffer:

@@ -12,9 +12,18 @@ class DivergedError(RuntimeError):
     """The learner produced a number that is not finite; the last good checkpoint is kept."""
 
 
-@jax.jit
+FINITE, INSERTED = "finite", "inserted"
+"""What an epoch tells the guards, beside its metrics: whether every number of the learner is
+finite, and how many transitions were kept since the run began."""
+
+
 def _finite(tree: Any) -> Any:
     return jax.tree.map(lambda x: jnp.all(jnp.isfinite(x)), tree)
+
+
+def all_finite(learner: Any) -> jax.Array:
+    """Return whether every number of the learner is finite."""
+    return jnp.all(jnp.stack(jax.tree.leaves(_finite(learner))))
 
 
 def check_finite(learner: Any) -> None:
@@ -23,7 +32,7 @@ def check_finite(learner: Any) -> None:
     Raises:
         DivergedError: Naming the first tensor that is not.
     """
-    for path, good in jax.tree_util.tree_flatten_with_path(_finite(learner))[0]:
+    for path, good in jax.tree_util.tree_flatten_with_path(jax.jit(_finite)(learner))[0]:
         if not bool(good):
             name = jax.tree_util.keystr(path, simple=True, separator=".")
             raise DivergedError(

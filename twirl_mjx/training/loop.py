@@ -16,13 +16,21 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from numpy.typing import ArrayLike
 
 from twirl_mjx.policies.learned import NumpyPolicy, load_policy
 from twirl_mjx.tasks.measures import episode_means
 from twirl_mjx.training import program
 from twirl_mjx.training.checkpoint import stored_steps
 from twirl_mjx.training.config import of_program
-from twirl_mjx.training.guards import DivergedError, check_experience, check_finite
+from twirl_mjx.training.guards import (
+    FINITE,
+    INSERTED,
+    DivergedError,
+    all_finite,
+    check_experience,
+    check_finite,
+)
 from twirl_mjx.training.guidance import Guide
 from twirl_mjx.training.learner_check import check_learner
 from twirl_mjx.training.logger import RunLogger
@@ -196,19 +204,27 @@ class Batch:
             if run.fault is None:
                 run.save(self.program.seed_state(states, index))
 
-    def guard(self, states: TrainState, logger: RunLogger) -> None:
+    def guard(
+        self, states: TrainState, finite: ArrayLike, inserted: ArrayLike, logger: RunLogger
+    ) -> None:
         """Take the seeds that diverged out of the books; the others go on.
+
+        Args:
+            states: Of all seeds.
+            finite: [S] whether every number of a learner is finite.
+            inserted: [S] transitions kept so far.
+            logger: Told who stops.
 
         Raises:
             DivergedError: All have.
         """
-        learners = program.split(states.learner, len(self.runs))
-        inserted = np.atleast_1d(np.asarray(states.inserted))
+        finite, inserted = np.atleast_1d(finite), np.atleast_1d(inserted)
         for index, run in enumerate(self.runs):
             if run.fault is not None:
                 continue
             try:
-                check_finite(learners[index])
+                if not finite[index]:
+                    check_finite(program.split(states.learner, len(self.runs))[index])
                 check_experience(
                     int(inserted[index]),
                     int(states.env_steps),
@@ -241,7 +257,8 @@ class Batch:
             "source_rows": np.array([run.source_rows for run in self.runs]),
         }
         if self.took_weights:  # what training has to beat
-            self.guard(states, logger)
+            learners = program.split(states.learner, len(self.runs))
+            self.guard(states, [all_finite(each) for each in learners], states.inserted, logger)
             with logger.aside("evaluating the weights taken over ..."):
                 logger.log(0, 0, self.evaluate(states))
         while (steps := int(states.env_steps)) < config.total_env_steps and not (
@@ -257,7 +274,7 @@ class Batch:
             values = {name: np.asarray(value) for name, value in metrics.items()} | fixed
             if not self.note_drops(values[FIRST_DROP]):
                 del values[FIRST_DROP]
-            self.guard(states, logger)
+            self.guard(states, values.pop(FINITE), values.pop(INSERTED), logger)
             for run in self.live:
                 run.progress["wall_s"] = before + time.monotonic() - began
             now = int(states.env_steps)

@@ -17,6 +17,7 @@ from twirl_mjx.replay.mixed import MixedReplay
 from twirl_mjx.tasks import measures
 from twirl_mjx.tasks.measures import Tracker
 from twirl_mjx.training.config import TrainConfig
+from twirl_mjx.training.guards import FINITE, INSERTED, all_finite
 from twirl_mjx.training.guidance import Guide
 from twirl_mjx.training.learners import learner_of
 from twirl_mjx.training.metrics import FIRST_DROP
@@ -218,7 +219,8 @@ def train_epoch(
     """Run ``steps_per_epoch`` vector steps; the body of the only training jit.
 
     Returns:
-        The new state and scalar metrics of the epoch; NaN where nothing was measured.
+        The new state and scalar metrics of the epoch, NaN where nothing was measured; what the
+        guards want to know (``guards.FINITE``, ``INSERTED``) is among them.
     """
     state, (learning, worlds, finished) = jax.lax.scan(
         lambda s, _: train_step(config, env, s, guide), state, length=config.steps_per_epoch
@@ -233,6 +235,7 @@ def train_epoch(
         "episodes": episodes,
         "online_rows": state.replay.online.size.astype(jnp.float32),
     }
+    metrics |= {FINITE: all_finite(state.learner), INSERTED: state.inserted}
     if state.share is not None:
         assert state.replay.source is not None, "a share of source rows has a source ring"
         gathered = config.steps_per_epoch * env.num_envs
