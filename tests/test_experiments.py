@@ -14,14 +14,16 @@ from twirl_mjx.sweep import grid as grids
 from twirl_mjx.sweep import plan
 from twirl_mjx.sweep.grid import load
 
-NAMES = ("phi", "shifts", "tasks", "utd")
+NAMES = ("auto", "phi", "shifts", "tasks", "utd")
 pytestmark = pytest.mark.usefixtures("no_shipped_policies")
 BOTH = [(name, reduced) for name in NAMES for reduced in (False, True)]
 CELLS = {
+    ("auto", False): 2 * 2 * 3,
+    ("auto", True): 2 * 2 * 3,
     ("tasks", False): 2 * 2 * 3 + 2,
     ("tasks", True): 2 * 2 * 2 + 2,
     ("shifts", False): 2 * 5 * 4 * 3,
-    ("shifts", True): 2 * 5 * 3,
+    ("shifts", True): 2 * 5 * 3 * 3,
     ("phi", False): 2 * 5 * 4 * 3,
     ("phi", True): 2 * 4 * 3,
     ("utd", False): 2 * 5 * 4 * 3,
@@ -72,7 +74,7 @@ def test_full_form_is_the_papers(name: str) -> None:
         budget = 100_000 if config.shift != "none" else 3_000_000 if scratch_on_hurdles else 10**6
         assert draft.preset == "paper"
         assert config.total_env_steps == budget
-        assert config.replay.phi == 0.5 or name == "phi"
+        assert config.replay.phi == 0.5 or name in ("phi", "auto")
         assert config.droq.utd == 20 or name == "utd"
         assert config.eval.final_episodes == 100
     seeds = {draft.config.seed for draft in load(name).drafts}

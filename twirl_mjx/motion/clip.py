@@ -216,6 +216,13 @@ def frame_velocities(clip: Clip) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return velocities[0], velocities[1], velocities[2]
 
 
+MARGIN = 1e-4
+"""Frames and cycles by which a time counts as the next one's.
+
+Control steps fall on frames. A compiler may compute a time twice, rounded in two ways, and find two
+frames for it: the orientation was a whole frame late then (seen with AVX-512)."""
+
+
 def slerp(a: jax.Array, b: jax.Array, fraction: jax.Array) -> jax.Array:
     """Interpolate on the shorter great circle from quaternions ``a`` to ``b`` [..., 4].
 
@@ -274,10 +281,11 @@ def sample(clip: ClipArrays, time: jax.Array | float) -> tuple[jax.Array, jax.Ar
     """
     time = jnp.asarray(time, clip.root_pos.dtype)
     duration = clip.cycle_duration
-    cycle = jnp.floor(time / duration) if clip.loop == "wrap" else jnp.zeros_like(time)
+    cycle = jnp.floor(time / duration + MARGIN) if clip.loop == "wrap" else jnp.zeros_like(time)
     inside = jnp.clip(time - cycle * duration, 0.0, duration)
     place = inside / clip.frame_duration
-    first = jnp.clip(jnp.floor(place).astype(jnp.int32), 0, clip.root_pos.shape[0] - 2)
+    first = jnp.floor(place + MARGIN).astype(jnp.int32)
+    first = jnp.clip(first, 0, clip.root_pos.shape[0] - 2)
     u = jnp.clip(place - first, 0.0, 1.0)
 
     def lerp(values: jax.Array) -> jax.Array:
