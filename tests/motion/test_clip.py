@@ -119,6 +119,16 @@ def test_numpy_and_jax_sampling_agree(changes: dict[str, Any]) -> None:
     np.testing.assert_allclose(qpos[:, 7:], want[:, 7:], atol=2e-5)
 
 
+@pytest.mark.parametrize("frame", [1, 3, 8])  # the last begins the second cycle
+def test_a_time_that_is_rounded_below_a_frame_is_that_frame_s(frame: int) -> None:
+    """A compiler may round one time in two ways; both must find the same two frames."""
+    clip = make_clip()
+    at = frame * clip.frame_duration
+    qpos, qvel = SAMPLE(clip.to_arrays(), jnp.array([at * (1.0 - 1e-5), at], jnp.float32))
+    np.testing.assert_allclose(qpos[0, 3:], qpos[1, 3:], atol=3e-7)
+    np.testing.assert_allclose(qvel[0], qvel[1], atol=3e-6)
+
+
 def test_offset_flags_off_repeat_the_first_cycle() -> None:
     clip = make_clip(yaw_per_cycle=0.7, cycle_offset_position=False)
     np.testing.assert_array_equal(clip.cycle_displacement, 0.0)
