@@ -38,6 +38,18 @@ def test_every_link_starts_from_the_one_before_and_shifts_from_the_target(
     assert {config.seed for config in configs} == {3}
 
 
+def test_links_from_another_source_have_another_name() -> None:
+    def links(source: str) -> list[tuple[str, str]]:
+        options = CurriculumOptions(source=source, shifts=("icy", "gravity"), runs=Path("r"))
+        return [(name, config.source) for name, config in plan(options, "cpu")]
+
+    (target, _), *shifts = links("trot")
+    assert target.startswith("biped-twirl-cpu-s0-")
+    assert shifts == [(f"{target}-{shift}", f"r/{target}") for shift in ("icy", "gravity")]
+    own = {name for source in ("", "trot", "bound") for name, _ in links(source)}
+    assert len(own) == len(links("")) + 3 + 3
+
+
 def test_walk_has_an_easier_reward_and_biped_the_paper_s() -> None:
     links = plan(CurriculumOptions(shifts=()), "cpu")
     _, (_, walk), (_, biped) = links

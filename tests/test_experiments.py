@@ -14,12 +14,14 @@ from twirl_mjx.sweep import grid as grids
 from twirl_mjx.sweep import plan
 from twirl_mjx.sweep.grid import load
 
-NAMES = ("auto", "phi", "shifts", "tasks", "utd")
+NAMES = ("auto", "guide", "phi", "shifts", "tasks", "utd")
 pytestmark = pytest.mark.usefixtures("no_shipped_policies")
 BOTH = [(name, reduced) for name in NAMES for reduced in (False, True)]
 CELLS = {
     ("auto", False): 2 * 2 * 3,
     ("auto", True): 2 * 2 * 3,
+    ("guide", False): 3 * 2 * 3,
+    ("guide", True): 3 * 2 * 3,
     ("tasks", False): 2 * 2 * 3 + 2,
     ("tasks", True): 2 * 2 * 2 + 2,
     ("shifts", False): 2 * 5 * 4 * 3,

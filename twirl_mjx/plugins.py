@@ -20,6 +20,9 @@ from typing import Any
 from twirl_mjx import files
 from twirl_mjx.checks import check_choice, nearest
 
+MINARI = "minari:"
+"""How the name of a dataset of Minari begins, where a source is named."""
+
 
 def is_reference(text: str) -> bool:
     """Return whether a text is of the form ``file.py:Name`` (not whether that exists)."""

@@ -261,6 +261,22 @@ def test_episode_depends_on_its_seed_only() -> None:
     assert np.linalg.norm(first[0].goals[0]) == pytest.approx(1.0)
 
 
+def test_a_divergence_ends_the_episode_and_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    """MuJoCo alone would go on from its first pose without a word."""
+    step = mujoco.mj_step
+
+    def diverging(model: mujoco.MjModel, data: mujoco.MjData) -> None:
+        if data.time > 0.5:
+            data.qvel[2] = np.nan
+        step(model, data)
+
+    monkeypatch.setattr(module.mujoco, "mj_step", diverging)
+    (episode,) = rehearse("zero", task="stand", episodes=1, config=IDEAL).episodes
+    assert episode.cause == "diverged"
+    assert episode.metrics["episode_length"] == pytest.approx(0.5 * 20, abs=1.0)
+    assert np.isfinite(episode.qpos).all() and np.isfinite(episode.metrics["return"])
+
+
 def test_arrays_of_an_episode_line_up() -> None:
     episode = rehearse(Constant(0.0), task="biped", episodes=1, config=SHORT).episodes[0]
     assert episode.cause == "time"

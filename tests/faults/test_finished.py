@@ -40,6 +40,12 @@ def done(tmp_path: Path) -> RunDir:
     return run_dir
 
 
+@pytest.fixture
+def checkpointed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever the run, it has a checkpoint to go on from."""
+    monkeypatch.setattr(rundir, "has_checkpoint", lambda path: True)
+
+
 def change(run_dir: RunDir, edit: Callable[[list[list[str]]], object]) -> None:
     """Edit the rows of ``eval.csv`` in place, the header first."""
     with run_dir.episodes.open(newline="") as file:
@@ -88,6 +94,7 @@ def test_a_whole_run_is_finished(done: RunDir) -> None:
     assert done.status(CONFIG) == found
 
 
+@pytest.mark.usefixtures("checkpointed")
 @pytest.mark.parametrize("damage", DAMAGE)
 def test_a_damaged_evaluation_does_not_finish_a_run(damage: str, done: RunDir) -> None:
     edit, message = DAMAGE[damage]
@@ -106,6 +113,29 @@ def test_the_remedy_helps(done: RunDir) -> None:
     assert done.finished() is None
     done.write_episodes(CONFIG, 96, values())
     assert isinstance(done.status(CONFIG), rundir.Finished)
+
+
+def test_a_pruned_run_is_not_trained_anew(done: RunDir) -> None:
+    """Its policy would be lost; so the message does not say that deleting helps."""
+    change(done, halve)
+    with pytest.raises(ValueError, match=r"checkpoints are gone; `twirl evaluate` judges its poli"):
+        done.finished()
+    done.episodes.unlink()
+    done.policy.write_bytes(b"p")
+    status = done.status(CONFIG)
+    assert isinstance(status, Foreign)
+    assert "would be trained anew; nothing was touched" in str(status.error)
+    with pytest.raises(rundir.RunMismatchError, match="trained anew"):
+        pipeline.run(CONFIG, "debug", done.path.parent, "a", print)
+    assert done.policy.read_bytes() == b"p"
+
+
+def test_a_run_closed_beyond_its_budget_stays_finished_when_pruned(done: RunDir) -> None:
+    """It was stopped at 640 and its budget lowered to 96; or it was closed with more episodes."""
+    done.write_episodes(CONFIG, 640, values())
+    assert done.status(CONFIG) == done.finished()
+    more = dataclasses.replace(CONFIG.eval, final_episodes=EPISODES + 1)
+    assert isinstance(done.status(dataclasses.replace(CONFIG, eval=more)), rundir.Finished)
 
 
 def test_runs_of_older_versions_stay_finished(done: RunDir) -> None:

@@ -19,9 +19,11 @@ from twirl_mjx.figures.report import write_report
 from twirl_mjx.figures.summary import summarise
 from twirl_mjx.figures.tables import read_directory, read_episodes, read_table
 from twirl_mjx.sweep.describe import describe
-from twirl_mjx.sweep.gather import gather, gather_runs, nominal_notes, settings_of, thin
+from twirl_mjx.sweep.gather import arm_of, gather, gather_runs, nominal_notes, settings_of, thin
 from twirl_mjx.sweep.grid import Grid, grids_folder, load
 from twirl_mjx.sweep.plan import Cell, make_plan
+from twirl_mjx.training.presets import make_config
+from twirl_mjx.training.rundir import RunDir
 
 Finish = Callable[..., Path]
 
@@ -119,6 +121,24 @@ def test_tables_of_adaptation_name_the_nominal_run(tmp_path: Path, finish_run: F
     assert nominal_notes(others) == [f"# nominal: mine, {nominal}"]
 
 
+@pytest.mark.parametrize(
+    ("seed", "name", "arm"),
+    [
+        (0, "biped-twirl-cpu-s0", "biped-twirl-cpu"),
+        (12, "biped-twirl-cpu-s12-source_trot", "biped-twirl-cpu-source_trot"),
+        (1, "try-s12", "try-s12"),
+        (1, "a-s1-b-s1", "a-s1-b"),
+        (1, "mine", "mine"),
+    ],
+)
+def test_an_arm_is_the_name_without_the_seed(
+    seed: int, name: str, arm: str, tmp_path: Path
+) -> None:
+    run = RunDir(tmp_path / name)
+    run.open(dataclasses.replace(make_config("stand", "debug"), seed=seed))
+    assert arm_of(run) == arm
+
+
 def test_runs_by_themselves_are_reported(
     plan_of: tuple[Grid, tuple[Cell, ...]],
     tmp_path: Path,
@@ -129,7 +149,10 @@ def test_runs_by_themselves_are_reported(
     two = [cell for cell in cells if cell.config.task == "biped"][:2]
     paths = [finish_run(cell, tmp_path / "runs") for cell in two]
     folder = gather_runs(paths, tmp_path / "results")
-    arms = {re.sub(r"-s\d+$", "", path.name) for path in paths}
+    arms = {
+        path.name.replace(f"-s{cell.config.seed}", "", 1)
+        for path, cell in zip(paths, two, strict=True)
+    }
     assert {p.name for p in folder.glob("*.csv")} == {
         f"{arm}{suffix}.csv" for arm in arms for suffix in ("", ".episodes")
     }

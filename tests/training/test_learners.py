@@ -20,7 +20,8 @@ from twirl_mjx.droq.learner import LEARNER
 from twirl_mjx.droq.state import AdamState, adam_init, adam_step
 from twirl_mjx.policies.learned import load_policy
 from twirl_mjx.replay import ring
-from twirl_mjx.training import config_json, learners, loop, state, weights
+from twirl_mjx.sweep import estimate, grid, plan
+from twirl_mjx.training import api, config_json, learners, loop, pipeline, state, weights
 from twirl_mjx.training.config import TrainConfig
 from twirl_mjx.training.learner_check import check_learner
 from twirl_mjx.training.presets import make_config
@@ -258,3 +259,40 @@ def test_what_a_learner_returns_is_checked_before_anything_is_compiled(
     with pytest.raises(ValueError, match=f"learner clone: {message}") as refusal:
         check_learner(CloneConfig(), 7, 3)
     assert "\n" not in str(refusal.value)
+
+
+def test_a_learner_is_named_in_a_grid_and_from_python(
+    clone: Learner, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    settings = {"task": "stand", "learner": "clone", "clone.utd": 2.0}
+    config = grid.configure("debug", settings, "here")
+    assert config.learner == "clone" and config.droq == CloneConfig(utd=2.0)
+    with pytest.raises(ValueError, match=r"^here: unknown learner 'clon'.*nearest: 'clone'"):
+        grid.configure("debug", settings | {"learner": "clon"}, "here")
+
+    class Trained(Exception):  # noqa: N818, it ends the call
+        pass
+
+    def train(config: TrainConfig, *_: Any) -> None:
+        raise Trained(config)
+
+    monkeypatch.setattr(pipeline, "run_seeds", train)
+    with pytest.raises(Trained) as told:
+        api.train("stand", preset="debug", learner="clone", clone={"utd": 2.0}, runs=tmp_path)
+    assert told.value.args == (config,)
+
+
+def test_runs_of_a_learner_do_not_stop_the_estimates_of_others(
+    clone_config: TrainConfig, stand_config: TrainConfig, tmp_path: Path
+) -> None:
+    run_dir = RunDir(tmp_path / "clone")
+    run_dir.open(clone_config)
+    columns = "metric,grad_steps,value"
+    rows = (f"{name},4,8.0" for name in ("env_steps_per_s", "updates_per_s"))
+    run_dir.metrics.write_text("\n".join([columns, *rows, ""]))
+    (speed,) = estimate.measure(tmp_path)
+    assert (speed.env_steps_per_s, speed.updates_per_s) == (8.0, 8.0)
+    for config, basis in ((clone_config, "measured"), (stand_config, "default")):
+        cell = plan.Cell("a", "arm", "debug", config, "")
+        assert estimate.estimate(cell, tmp_path, [speed]).basis == basis
+    assert estimate.default_rate(clone_config) > 0.0

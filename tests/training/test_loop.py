@@ -276,6 +276,22 @@ def test_options_of_the_source_task_may_change(stand_config: TrainConfig) -> Non
     assert "stand." in rundir.may_change(make_config("biped", "debug"))
 
 
+def test_a_budget_that_is_lowered_to_what_there_is_closes_the_run(
+    stand_config: TrainConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Stopped before its first evaluation it has no policy yet."""
+    rarely = dataclasses.replace(
+        stand_config, eval=dataclasses.replace(stand_config.eval, every=96)
+    )
+    monkeypatch.setattr(loop.Batch, "is_late", lambda batch: bool(batch.runs[0].progress["wall_s"]))
+    with pytest.raises(pipeline.StoppedError, match="stopped at 32"):
+        train(rarely, tmp_path / "a")
+    assert not (tmp_path / "a" / "policy.npz").exists()
+    done = train(dataclasses.replace(rarely, total_env_steps=20), tmp_path / "a")
+    assert done.env_steps == 32
+    assert load_policy(tmp_path / "a" / "policy.npz").header.card["env_steps"] == 32
+
+
 def test_stop_event_saves_and_ends_the_loop(
     stand_config: TrainConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

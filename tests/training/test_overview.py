@@ -60,6 +60,29 @@ def test_a_finished_run(tmp_path: Path) -> None:
     )
 
 
+def test_a_finished_run_that_goes_on_is_not_finished(tmp_path: Path) -> None:
+    path = make_run(tmp_path, "a")
+    finished = overview.look(path)
+    config = json.loads((path / "config.json").read_text())
+    (path / "config.json").write_text(json.dumps(config | {"total_env_steps": 900}))
+    longer = METRICS + "a,biped,none,twirl,0,q_mean,600,60,14.5,800\n"
+    (path / "metrics.csv").write_text(longer)
+    run = overview.look(path)
+    assert (run.state, run.env_steps) == ("stopped", 600)
+    for stale in (run, finished):
+        with pytest.raises(ValueError, match="is stopped, and only finished runs are pruned"):
+            overview.prune(stale)
+    assert (path / "checkpoints").is_dir()
+    zero_shot = config | {"total_env_steps": 900, "variant": "zero-shot"}
+    (path / "config.json").write_text(json.dumps(zero_shot))
+    assert overview.look(path).state == "finished"
+
+
+def test_datasets_of_minari_are_no_condition() -> None:
+    assert overview.condition("minari:biped-v0") is None
+    assert overview.condition("task:biped") == ("task", "biped")
+
+
 def test_states(tmp_path: Path) -> None:
     stopped = make_run(tmp_path, "stopped", finished=False)
     assert overview.look(stopped).state == "stopped"

@@ -108,7 +108,9 @@ def plan(options: CurriculumOptions, preset: str) -> list[tuple[str, TrainConfig
             source_command="",
             total_env_steps=budget,
         )
-        links.append((f"{task}-{shift}-chain-{preset}-s{options.seed}", adapted))
+        chained = f"{task}-{shift}-chain-{preset}-s{options.seed}"
+        # From a source that was named, a link is named after the run that learned from it.
+        links.append((f"{target}-{shift}" if options.source else chained, adapted))
     return links
 
 

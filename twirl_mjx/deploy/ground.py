@@ -85,6 +85,8 @@ def build_model(config: RehearsalConfig, hurdles: np.ndarray) -> mujoco.MjModel:
         )
     _add_sky(spec)
     model = spec.compile()
+    # A divergence must be seen, not restarted from the first pose without a word.
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
     model.actuator_gainprm[:], model.actuator_biasprm[:] = 0.0, 0.0
     model.actuator_gainprm[:, 0] = 1.0
     model.actuator_ctrllimited[:] = model.actuator_forcelimited[:] = 0

@@ -108,11 +108,11 @@ def advance(
         encoder.push(data)
         np.maximum(drive.peak, np.abs(torque), out=drive.peak)
         drive.work += np.abs(torque * joint_vel) * config.sim_dt
+        if not (np.isfinite(data.qpos).all() and np.isfinite(data.qvel).all()):
+            return "diverged"
         cause = contacts.cause(data)
         if cause is not None:
             return cause
-    if not (np.isfinite(data.qpos).all() and np.isfinite(data.qvel).all()):
-        return "diverged"
     return None
 
 

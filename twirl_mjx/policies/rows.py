@@ -18,6 +18,7 @@ import numpy as np
 
 from twirl_mjx import array_files, files, plugins
 from twirl_mjx.checks import choose_one
+from twirl_mjx.plugins import MINARI
 from twirl_mjx.replay.dataset import DatasetError
 
 NAMES: dict[str, tuple[str, ...]] = {
@@ -37,8 +38,6 @@ NAMES: dict[str, tuple[str, ...]] = {
 INSTANTS = ("obs", "qpos", "qvel")
 """Fields of an instant; what they were a control step later stands in ``next_*``."""
 HDF5 = (".hdf5", ".h5")
-MINARI = "minari:"
-"""How the name of a dataset of Minari begins."""
 MINARI_FILE = "main_data.hdf5"
 WHAT = "a source dataset"
 OUR_WORLDS = "twirl_mjx.worlds.adapters:to_gymnasium"

@@ -77,9 +77,8 @@ def _rates(path: Path) -> tuple[float, float] | None:
 
 
 def _learner(config: TrainConfig) -> tuple[object, ...]:
-    droq = config.droq
-    sizes = (droq.hidden_sizes, droq.num_critics, droq.batch_size)
-    return (*sizes, droq.matmul_dtype, droq.fast, droq.form)
+    names = ("hidden_sizes", "num_critics", "batch_size", "matmul_dtype", "fast", "form")
+    return (config.learner, *(getattr(config.droq, name, None) for name in names))
 
 
 def _setting(config: TrainConfig) -> tuple[object, ...]:
@@ -106,6 +105,6 @@ def estimate(cell: Cell, runs: Path, speeds: Sequence[Speed]) -> Estimate:
 
 def default_rate(config: TrainConfig) -> float:
     """Return critic updates per second of one core where nothing was measured."""
-    width = max(config.droq.hidden_sizes)
+    width = max(getattr(config.droq, "hidden_sizes", (min(UPDATES_PER_S),)))
     nearest = min((w for w in UPDATES_PER_S if w >= width), default=max(UPDATES_PER_S))
     return UPDATES_PER_S[nearest] * min(1.0, (nearest / width) ** 2)

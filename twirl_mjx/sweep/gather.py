@@ -167,6 +167,12 @@ def episode_rows(run: RunDir) -> list[Row]:
     return files.read_rows(run.episodes, "the evaluation of a run", cells_of(EPISODE_COLUMNS))
 
 
+def arm_of(run: RunDir) -> str:
+    """Return the name of a run but for its seed, wherever that stands in it."""
+    seed = rf"-s{run.read_config().seed}(?!\d)"
+    return re.sub(rf"{seed}(?!.*{seed})", "", run.name)
+
+
 def gather_runs(paths: Sequence[Path], results: Path) -> Path:
     """Write the tables of finished runs, one arm for those of one name but for the seed.
 
@@ -181,7 +187,7 @@ def gather_runs(paths: Sequence[Path], results: Path) -> Path:
         if not run.episodes.is_file():
             raise ValueError(f"{run} is not finished, and only finished runs are reported"
                              " (nearest: status:finished)")  # fmt: skip
-        arms.setdefault(re.sub(r"-s\d+$", "", run.name), []).append(run)
+        arms.setdefault(arm_of(run), []).append(run)
     if not arms:
         raise ValueError("no run to report")
     folder = results / "runs"

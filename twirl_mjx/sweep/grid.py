@@ -219,8 +219,9 @@ def configure(preset: str, settings: Settings, where: str) -> TrainConfig:
         raise ValueError(f"{where} has no 'task'")
     check_type(f"{where}: task", settings["task"], str)
     try:
-        plain = make_config(settings["task"], preset)
-        return settle(plain, {k: v for k, v in settings.items() if k != "task"})
+        learner = settings.get("learner", TrainConfig.learner)
+        plain = make_config(settings["task"], preset, learner)
+        return settle(plain, {k: v for k, v in settings.items() if k not in ("task", "learner")})
     except ValueError as error:
         raise ValueError(f"{where}: {error}") from None
 

@@ -143,7 +143,7 @@ def _source_of(
         case source_rules.InFile(reference):
             file, name = plugins.split(reference, "policy")
             return f"{_identity_of_path(file)} {name}", f"{file}:{name}", ()
-        case source_rules.AtPath(path) if str(path).startswith(rows.MINARI):
+        case source_rules.AtPath(path) if str(path).startswith(plugins.MINARI):
             return f"{path} {files.checksum(rows.find_minari(str(path))[0])[:12]}", str(path), ()
         case source_rules.AtPath(path, is_shipped):
             return _identity_of_path(path), "auto" if is_shipped else str(path.resolve()), ()

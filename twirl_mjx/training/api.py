@@ -107,7 +107,8 @@ def train(
     elif source is not None:
         kind = type(source)
         given = Source(source, f"object {kind.__qualname__}", f"{kind.__module__}.{kind.__name__}")
-    config = settle(make_config(registered, preset), flat)
+    learner = flat.pop("learner", TrainConfig.learner)
+    config = settle(make_config(registered, preset, learner), flat)
     several = None if seeds is None else list(seeds)
     if several is not None and "seed" in settings:
         raise ValueError(f"seed {settings['seed']} beside seeds {several}: give one of them")

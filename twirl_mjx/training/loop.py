@@ -287,6 +287,10 @@ class Batch:
             if time.monotonic() - saved > 60.0 * config.checkpoint_minutes:
                 self.save(states)
                 saved = time.monotonic()
+        now = int(states.env_steps)
+        if now >= config.total_env_steps and not all(r.run_dir.policy.exists() for r in self.live):
+            with logger.aside("evaluating ..."):  # the budget was lowered to what there is
+                logger.log(now, grad_steps(states), self.evaluate(states))
         self.save(states)
         return states
 

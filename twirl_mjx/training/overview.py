@@ -19,7 +19,7 @@ from typing import Any, Literal
 from twirl_mjx import files
 from twirl_mjx.checks import check_choice, choose_one
 from twirl_mjx.machine import try_lock
-from twirl_mjx.plugins import is_reference
+from twirl_mjx.plugins import MINARI, is_reference
 
 State = Literal["running", "finished", "stopped", "empty", "damaged"]
 STATES: tuple[State, ...] = ("running", "finished", "stopped", "empty", "damaged")
@@ -73,7 +73,7 @@ def known(folder: Path) -> list[Path]:
 def condition(word: str) -> tuple[str, str] | None:
     """Return setting and value of a word such as ``task:biped``, None where it is no such word."""
     match = re.fullmatch(r"([a-z][a-z0-9_.]*):([^/]+)", word)
-    if match is None or is_reference(word) or Path(word).exists():
+    if match is None or is_reference(word) or word.startswith(MINARI) or Path(word).exists():
         return None
     return match[1], match[2]
 
@@ -147,16 +147,16 @@ def expand(words: Sequence[str], folder: Path, but: Collection[str] = ()) -> lis
 def look(path: Path) -> Overview:
     """Return how a run stands."""
     settings = _settings(path / CONFIG)
-    measures = means(path / EPISODES)
+    state, measures = _state(path, settings), means(path / EPISODES)
     last, best = _curve(path / METRICS)
     closing = measures.get("return")
     sizes = {p: p.stat() for p in path.rglob("*") if p.is_file() and not p.is_symlink()}
     closed = _first_row(path / EPISODES)
     return Overview(
         path=path,
-        state=_state(path, settings),
+        state=state,
         settings=settings,
-        env_steps=int(float((closed or last).get("env_steps", 0))),
+        env_steps=int(float((closed if state == "finished" else last).get("env_steps", 0))),
         best_return=max((v for v in (best, closing) if v is not None), default=None),
         measures=measures,
         wall_s=float(last.get("wall_s", 0.0)),
@@ -167,14 +167,25 @@ def look(path: Path) -> Overview:
 
 
 def _state(path: Path, settings: dict[str, Any]) -> State:
-    if is_held(path):
-        return "running"
+    return "running" if is_held(path) else _standing(path, settings)
+
+
+def _standing(path: Path, settings: dict[str, Any]) -> State:
+    """Return how a run stands in which nobody works."""
     if not settings:
         return "damaged"
-    if (path / EPISODES).is_file():
+    closed = _first_row(path / EPISODES)
+    if closed and not _goes_on(settings, int(float(closed.get("env_steps") or 0))):
         return "finished"
     work = (CHECKPOINTS, METRICS, DATASET)
     return "stopped" if any((path / name).exists() for name in work) else "empty"
+
+
+def _goes_on(settings: dict[str, Any], closed_at: int) -> bool:
+    """Return whether a run that was closed has been given more transitions since."""
+    budget = settings.get("total_env_steps", 0)
+    is_trained = settings.get("variant") != "zero-shot"
+    return is_trained and isinstance(budget, int) and budget > closed_at
 
 
 def is_held(path: Path) -> bool:
@@ -250,6 +261,8 @@ def differences(runs: Sequence[Overview]) -> dict[str, list[Any]]:
 def prune(run: Overview) -> int:
     """Delete what a finished run can do without; never a policy, table or config.
 
+    Whether it is finished is looked at again once nobody else can work there.
+
     Returns:
         Bytes that were deleted.
 
@@ -262,6 +275,8 @@ def prune(run: Overview) -> int:
     with (run.path / ".lock").open("a+") as file:
         if not try_lock(file):
             raise RuntimeError(f"{run.path} is in use by another process")
+        if (now := _standing(run.path, _settings(run.path / CONFIG))) != "finished":
+            raise ValueError(f"{run.path} is {now}, and only finished runs are pruned")
         for name in PRUNED:
             target = run.path / name
             if target.is_symlink() or target.is_file():

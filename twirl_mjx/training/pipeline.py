@@ -19,7 +19,8 @@ import numpy as np
 
 from twirl_mjx import exits, files
 from twirl_mjx.checks import check_once, choose_one
-from twirl_mjx.policies import recorded, rows
+from twirl_mjx.plugins import MINARI
+from twirl_mjx.policies import recorded
 from twirl_mjx.policies.resolve import SCRIPTED_SOURCES, Source, check_acts, resolve_policy
 from twirl_mjx.replay import ring
 from twirl_mjx.training import config_json, loop, memory, rundir, sharding, source_rules
@@ -406,7 +407,7 @@ def place_of(rule: source_rules.Rule, config: TrainConfig, preset: str, runs_dir
 
 def _is_there(path: Path) -> bool:
     """Return whether a source may exist: what Minari keeps has a name and no path."""
-    return path.exists() or str(path).startswith(rows.MINARI)
+    return path.exists() or str(path).startswith(MINARI)
 
 
 def no_such_source(path: Path, runs_dir: Path) -> str:

@@ -49,6 +49,8 @@ EVAL_CELLS = {"env_steps": int, "episode": int, "metric": str, "value": float}
 WHOLE = ("return", "episode_length")
 """Measures that every episode has."""
 EVALUATE_AGAIN = "delete it, and the command that trained the run evaluates again"
+JUDGE_POLICY = "the run is not touched, since its checkpoints are gone; `twirl evaluate` judges its"
+"""Where it cannot: that command would train anew."""
 SUMS_AGAIN = "delete it: the evaluation counts without it"
 
 
@@ -210,6 +212,12 @@ class RunDir:
                 " gone, so it cannot go on; nothing was touched. Give another --name; its policy"
                 f" can start that run: --variant weights --source {self.policy}"
             ))  # fmt: skip
+        if done is None and self.sums.exists() and budget and not has_checkpoint(self.path):
+            return Foreign(RunMismatchError(
+                f"{self} was finished, and its evaluation and its checkpoints are gone, so it would"
+                " be trained anew; nothing was touched. Give another --name; `twirl evaluate"
+                f" {self.policy}` judges its policy"
+            ))  # fmt: skip
         return Resumable()
 
     def _is_ours(self) -> bool:
@@ -255,10 +263,12 @@ class RunDir:
         if not self.episodes.is_file():
             return None
         what = "the evaluation of a run"
-        rows = files.read_rows(self.episodes, what, EVAL_CELLS, remedy=EVALUATE_AGAIN)
         config = self.read_config()
+        can_close = config.variant == "zero-shot" or has_checkpoint(self.path)
+        remedy = EVALUATE_AGAIN if can_close else f"{JUDGE_POLICY} {self.policy.name}"
+        rows = files.read_rows(self.episodes, what, EVAL_CELLS, remedy=remedy)
         if fault := self._fault_of(rows, config):
-            raise files.FileError(f"{self.episodes}: {fault}; {EVALUATE_AGAIN}")
+            raise files.FileError(f"{self.episodes}: {fault}; {remedy}")
         values: dict[str, list[float]] = {}
         for row in rows:
             values.setdefault(row["metric"], []).append(row["value"])
@@ -270,19 +280,19 @@ class RunDir:
         steps = {row["env_steps"] for row in rows}
         if len(steps) != 1:
             return f"{len(steps)} different env_steps, expected one"
+        known = self._sums().get(str(at := steps.pop()))  # versions before 0.2 have written none
+        if known == files.checksum(self.episodes):  # whatever budget the run has been given since
+            return None
         most = config.total_env_steps + config.steps_per_epoch * config.num_envs
         most = max(most, newest_checkpoint(self.path) or 0)
-        if not 0 <= (at := steps.pop()) <= most:
+        if not 0 <= at <= most:
             return f"env_steps {at:,}, and the run went to {most:,} at most"
         count = config.eval.final_episodes
         for name in WHOLE:
             episodes = sorted(row["episode"] for row in rows if row["metric"] == name)
             if episodes != list(range(count)):
                 return f"{len(episodes)} rows of {name}, expected one for each of {count} episodes"
-        known = self._sums().get(str(at))  # versions before 0.2 have written none
-        if known not in (None, files.checksum(self.episodes)):
-            return "its checksum is not that of what was written"
-        return None
+        return None if known is None else "its checksum is not that of what was written"
 
     def _sums(self) -> dict[str, str]:
         """Return env steps -> checksum of the evaluations that have closed this run."""
