@@ -22,6 +22,8 @@ import twirl_mjx
 from twirl_mjx import cli, plugins
 from twirl_mjx.commands import evaluate, options, render
 from twirl_mjx.commands.options import parse_train
+from twirl_mjx.policies.identity import digest_of
+from twirl_mjx.policies.scripted import get_scripted
 from twirl_mjx.sim.leaves import SHIFTS
 from twirl_mjx.sim.robots import ROBOTS
 from twirl_mjx.sweep import plan
@@ -29,7 +31,7 @@ from twirl_mjx.sweep.grid import load
 from twirl_mjx.tasks.registry import TASKS
 from twirl_mjx.tasks.task import Measure, Task
 from twirl_mjx.training.presets import make_config
-from twirl_mjx.training.rundir import RunDir
+from twirl_mjx.training.rundir import RunDir, RunMismatchError
 from twirl_mjx.worlds.config import WorldConfig
 
 ROOT = Path(__file__).parents[1]
@@ -260,7 +262,6 @@ def test_a_task_may_not_be_called_like_a_part_of_the_config(tmp_path: Path) -> N
 
 @pytest.mark.slow
 def test_a_source_object_from_python(tmp_path: Path) -> None:
-    from twirl_mjx.policies.scripted import get_scripted
 
     result = twirl_mjx.train(
         "stand",
@@ -274,10 +275,22 @@ def test_a_source_object_from_python(tmp_path: Path) -> None:
         say=lambda _: None,
     )
     assert result.directory == tmp_path / "mine"
-    assert RunDir(result.directory).read_source() == {
-        "origin": "object GaitPolicy",
-        "digest": "twirl_mjx.policies.scripted.GaitPolicy",
-    }
+    source = RunDir(result.directory).read_source()
+    assert source == {"origin": "object GaitPolicy", "digest": digest_of(get_scripted("trot"))}
+    with pytest.raises(
+        RunMismatchError, match=r"source digest: '.*GaitPolicy .* -> '.*GaitPolicy "
+    ):
+        twirl_mjx.train(
+            "stand",
+            preset="debug",
+            source=get_scripted("bound"),
+            variant="twirl",
+            runs=tmp_path,
+            name="mine",
+            total_env_steps=64,
+            droq={"utd": 1.0},
+            say=lambda _: None,
+        )
     steps, values = result.curves["source_rows"]
     assert steps.tolist() == [32.0, 64.0]
     assert values.tolist() == [64.0, 64.0]

@@ -14,6 +14,7 @@ import pytest
 from twirl_mjx import cli, files
 from twirl_mjx.figures.decisions import DROPPED, Decision, ancestry, read_decisions
 from twirl_mjx.figures.tree import contest_tree
+from twirl_mjx.policies.learned import load_policy
 from twirl_mjx.sweep import contest
 from twirl_mjx.sweep.contest import Candidate, Contest, Rules, rungs_of, stages_of
 
@@ -93,6 +94,8 @@ def test_a_winner_is_the_source_of_the_next_round_and_the_line_of_descent_is_tol
     assert winner.run == "c-3-walk"
     line = [row.run for row in ancestry(told.rows, winner.run)]
     assert line == ["c-1-walk-from-zero", "c-2-biped", "c-3-walk"]
+    handed_on = [*told.first(), *told.following(4, winner)]
+    assert {each.config.eval.keep for each in handed_on} == {"last"}  # and judged
     text = told.summary(winner)
     assert "chain: zero -> walk (c-1-walk-from-zero) -> biped (c-2-biped) -> walk (c-3" in text
     assert "better before: c-2-biped, 9.0 " in text
@@ -266,7 +269,11 @@ def test_a_contest_trains_judges_and_is_not_repeated(
     rows = read_decisions(folder / contest.DECISIONS)
     assert [row.run for row in rows if row.round == 0] == ["", ""]
     for run in {row.run for row in rows} - {""}:
-        assert (tmp_path / run / "policy.npz").is_file()
+        judged, last = (
+            load_policy(tmp_path / run / name).header.card["env_steps"]
+            for name in ("policy.npz", "policy_last.npz")
+        )
+        assert judged == last
     assert rows[-1].spent <= 1200
     assert (folder / "tree.png").stat().st_size > 5000
     before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("policy.npz")}

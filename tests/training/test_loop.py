@@ -276,6 +276,27 @@ def test_options_of_the_source_task_may_change(stand_config: TrainConfig) -> Non
     assert "stand." in rundir.may_change(make_config("biped", "debug"))
 
 
+@pytest.mark.parametrize(("keep", "kept"), [("best", [1, 1, 3]), ("last", [1, 2, 3])])
+def test_the_policy_of_a_run_is_the_best_or_the_last(
+    keep: Any, kept: list[int], stand_config: TrainConfig, tmp_path: Path
+) -> None:
+    evaluation = dataclasses.replace(stand_config.eval, keep=keep)
+    config = dataclasses.replace(stand_config, eval=evaluation)
+    batch = loop.Batch([Part(config, RunDir(tmp_path / "a"))], "test")
+    try:
+        (run,) = batch.runs
+        actor = batch.program.init().learner.actor
+        for number, value, expected in zip((1, 2, 3), (5.0, 4.0, 6.0), kept, strict=True):
+            counts = {"env_steps": number, "grad_steps": 0}
+            run.evaluated(actor, counts, {"return": np.full(4, value)})
+            assert load_policy(tmp_path / "a" / "policy.npz").header.card["env_steps"] == expected
+            last = load_policy(tmp_path / "a" / "policy_last.npz").header.card
+            assert last["env_steps"] == number
+        assert run.progress["best"] == 6.0
+    finally:
+        batch.close()
+
+
 def test_a_budget_that_is_lowered_to_what_there_is_closes_the_run(
     stand_config: TrainConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -50,6 +50,9 @@ from twirl_mjx.training.weights import source_weights
 
 Say = Callable[[str], None]
 
+KEEP = {"eval.keep": "last"}
+"""What is judged is what is handed on; the best would often be the source's own policy, with which
+runs that take over networks begin."""
 FIRST_SHARE = 0.5
 """Share of the budget for the first round of several: it alone starts with fresh networks."""
 DECISIONS, RECORD = "decisions.csv", "contest.json"
@@ -159,7 +162,7 @@ def candidate_config(
     own: dict[str, Any] = {"seed": rules.seed, "source": given}
     if source is None or source.run_dir is not None:
         settings = {**stage.settings, **own, "variant": "twirl+weights"}
-        config = configure(rules.preset, settings, f"stage {stage.name}")
+        config = configure(rules.preset, settings | KEEP, f"stage {stage.name}")
         with contextlib.suppress(ValueError):
             if source is not None:
                 source_weights(config, source, lambda _: None)
@@ -169,7 +172,8 @@ def candidate_config(
         own["allow_clipping"] = rules.terms.allow_clipping
     learner = f"{TrainConfig.learner}."
     world = {k: v for k, v in stage.settings.items() if not k.startswith(learner)}
-    return configure(rules.preset, {**world, **own, "variant": "twirl"}, f"stage {stage.name}")
+    settings = {**world, **own, **KEEP, "variant": "twirl"}
+    return configure(rules.preset, settings, f"stage {stage.name}")
 
 
 class Contest:
@@ -403,11 +407,8 @@ class Contest:
         return diverged
 
     def _measure(self, candidate: Candidate) -> np.ndarray:
-        """Return the measure of the run's last policy in the target task, an episode each.
-
-        The best one would often be the source's own, with which runs that take over networks begin.
-        """
-        actor = actor_of(RunDir(self.runs / candidate.run).last_policy)
+        """Return the measure of the run's policy (``KEEP``) in the target task, an episode each."""
+        actor = actor_of(RunDir(self.runs / candidate.run).policy)
         return self._judge(actor, self._key)[0][self.rules.measure]
 
     def _judge_source(self, word: str, source: Source) -> None:

@@ -13,6 +13,7 @@ import numpy as np
 
 from twirl_mjx import files
 from twirl_mjx.cache import use_cache
+from twirl_mjx.policies.identity import digest_of
 from twirl_mjx.policies.learned import load_policy
 from twirl_mjx.policies.resolve import Source
 from twirl_mjx.tasks.registry import TASKS
@@ -81,7 +82,8 @@ def train(
         seeds: Several seeds, trained in one program: a list of results, in their order.
         preset: ``paper``, ``cpu``, ``massive`` or ``debug``; ``cpu`` without an accelerator, else
             ``paper``.
-        source: A policy object (``types.SourcePolicy``), or what ``--source`` takes.
+        source: A policy object (``types.SourcePolicy``), or what ``--source`` takes. Runs of other
+            objects need other names (``policies.identity`` says how objects are told apart).
         name: Name of the run; derived from task, variant, preset and seed by default.
         runs: Folder of all runs.
         sinks: Where metrics go beside ``metrics.csv``, TensorBoard and the terminal: names
@@ -105,8 +107,7 @@ def train(
     if isinstance(source, str):
         flat["source"] = source
     elif source is not None:
-        kind = type(source)
-        given = Source(source, f"object {kind.__qualname__}", f"{kind.__module__}.{kind.__name__}")
+        given = Source(source, f"object {type(source).__qualname__}", digest_of(source))
     learner = flat.pop("learner", TrainConfig.learner)
     config = settle(make_config(registered, preset, learner), flat)
     several = None if seeds is None else list(seeds)

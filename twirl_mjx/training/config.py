@@ -16,6 +16,7 @@ from twirl_mjx.training.learners import DROQ, LEARNERS, settings_of
 from twirl_mjx.worlds.config import WorldConfig, world_fields
 
 Variant = Literal["scratch", "twirl", "twirl+weights", "weights", "zero-shot"]
+Keep = Literal["best", "last"]
 Guidance = Literal["none", "jump-start", "best-of"]
 VARIANTS: tuple[Variant, ...] = ("scratch", "twirl", "twirl+weights", "weights", "zero-shot")
 INT32_MAX = 2**31 - 1
@@ -36,6 +37,8 @@ class EvalConfig:
     """Control steps of an evaluation episode, and of those that record a source (20 s)."""
     seed: int = 1_000_003
     """Seed of evaluation during training; the final one uses ``seed + 1``."""
+    keep: Keep = "best"
+    """The policy of a run is that of its best evaluation, by the return, or of its last."""
 
     def __post_init__(self) -> None:
         """Check every number.
@@ -43,6 +46,7 @@ class EvalConfig:
         Raises:
             ValueError: A value is out of range.
         """
+        check_choice("eval.keep", self.keep, get_args(Keep))
         check_range("eval.every", self.every, 1, 10**12)
         check_range("eval.episodes", self.episodes, 1, 1_000_000)
         check_range("eval.final_episodes", self.final_episodes, 1, 1_000_000)

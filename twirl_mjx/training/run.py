@@ -135,11 +135,14 @@ class Run:
     def evaluated(
         self, actor: Any, counts: dict[str, int], values: dict[str, np.ndarray]
     ) -> dict[str, float]:
-        """Take an evaluation, measures [E]: keep the newest policy and the best; return means."""
+        """Take an evaluation, measures [E], and return means; keep the newest policy.
+
+        It is the policy of the run, too, if ``eval.keep`` says so or its return is the best.
+        """
         means = episode_means(values)
         self.save_policy(self.run_dir.last_policy, actor, counts, means)
-        if means["return"] > self.progress["best"]:
-            self.progress["best"] = means["return"]
+        if means["return"] > self.progress["best"] or self.config.eval.keep == "last":
+            self.progress["best"] = max(means["return"], self.progress["best"])
             self.save_policy(self.run_dir.policy, actor, counts, means)
         return means
 
