@@ -5,12 +5,17 @@ import pytest
 
 from twirl_mjx.figures import aggregate, cells, tables
 from twirl_mjx.figures.aggregate import Series
+from twirl_mjx.figures.bars import shift_bars
+from twirl_mjx.figures.curves import learning_curves
 from twirl_mjx.figures.errors import TableError
 from twirl_mjx.figures.facts import Axis, Facts, Measure
+from twirl_mjx.figures.summary import summarise
 
 
-def row(run, seed, env_steps, value, *, task="biped", shift="icy", variant="twirl"):
-    return [run, task, shift, variant, seed, "return", env_steps, 0, 0.0, value]
+def row(
+    run, seed, env_steps, value, *, task="biped", shift="icy", variant="twirl", metric="return"
+):
+    return [run, task, shift, variant, seed, metric, env_steps, 0, 0.0, value]
 
 
 @pytest.fixture
@@ -114,6 +119,23 @@ def test_values_are_compared_where_every_trained_run_has_been(table_of):
     late = [series([150], [1.0])]
     with pytest.raises(TableError, match="run 'r0' is first measured at 150 transitions"):
         aggregate.final_values(late, 100)
+
+
+def test_a_measure_that_is_seldom_defined_is_drawn_and_summarised(table_of):
+    """Hurdles passed in a single flight, by runs that hardly ever pass one."""
+    rows = [
+        *(row(r, k, s, 1.0) for k, r in enumerate("abc") for s in (50, 100)),
+        row("a", 0, 50, 0.5, metric="share"),
+        row("b", 1, 100, 0.5, metric="share"),
+    ]
+    table = table_of(rows)
+    shares = aggregate.run_series(tables.select(table, metric="share"))
+    for statistic in ("mean", "iqm"):
+        assert aggregate.curve(shares, statistic).centre.shape == (0,)  # they do not overlap
+        assert learning_curves(table, "share", statistic=statistic)
+    (found,) = summarise(table, "share")
+    assert (found.runs, found.seeds, found.env_steps) == ((0.5, 0.5), (0, 1), 100)
+    assert shift_bars(table, "share", statistic="iqm")
 
 
 def test_unmeasured_rows_are_left_out(table_of):

@@ -125,13 +125,15 @@ def common_axis(series: Sequence[Series], points: int = MAX_POINTS) -> np.ndarra
 
 
 def curve(series: Sequence[Series], statistic: str) -> Curve:
-    """Return the statistic of runs over their common axis.
+    """Return the statistic of runs over their common axis, empty if the runs do not overlap.
 
     Args:
         series: Runs of one cell.
         statistic: One of ``STATISTICS``.
     """
     axis = common_axis(series)
+    if not len(axis):  # a measure that is undefined most of the time
+        return Curve(axis, *np.empty((3, 0)))
     values = np.stack([step_hold(s, axis) for s in series])
     if check_statistic(statistic) != "mean":
         function = _BOOTSTRAPPED[statistic]
@@ -159,6 +161,9 @@ def common_end(table: Table) -> dict[tuple, int]:
 
     Runs without training (zero-shot, or a policy that learns nothing) do not count. This is the
     moment at which arms are compared: never one run's longer training against another's shorter.
+
+    Args:
+        table: Rows of all metrics: one that is seldom defined ends before its run does.
     """
     ends = {}
     for key, rows in groups(table, ["task", "shift"]).items():

@@ -92,7 +92,7 @@ def shift_bars(
         raise ValueError(f"cannot draw one bar per '{by}': {choose_one(by, _BARS_BY)}")
     rows = labelled(metric_rows(table, metric))
     tasks, shifts = ordered(rows, "task"), ordered(rows, "shift")
-    ends = {} if rows.is_episodes else common_end(rows)
+    ends = {} if rows.is_episodes else common_end(table)
     name = rows.facts.measure(metric).label
     title = f"{name[:1].upper()}{name[1:]} per dynamics shift"
     with canvas(title, rows, theme, (len(tasks), 1), (_bars_width(rows, by), 1.85)) as frame:
@@ -154,7 +154,7 @@ def ablation(
         raise TableError(f"{table.source}: column '{column}' is empty in every row")
     others = [c for c in ("variant", *rows.settings) if c != column and _varies(stated, c)]
     panels = groups(stated, ["task", "shift", *others])
-    ends = common_end(stated)
+    ends = common_end(mask(table, table[column] != ""))
     title = f"Effect of {column} on {rows.facts.measure(metric).label}"
     with canvas(title, rows, theme, (len(panels), 2), (7.4, 2.15)) as frame:
         marks = line_marks(stated, frame.theme, column)

@@ -82,7 +82,7 @@ def summarise(
     """
     rows = labelled(metric_rows(table, metric))
     baseline = rows.facts.baseline if baseline is None else baseline
-    ends = common_end(rows)
+    ends = common_end(table)
     summaries = []
     for place, part in groups(rows, ["task", "shift"]).items():
         cells = {key[0]: cell for key, cell in groups(part, [by]).items()}
