@@ -100,7 +100,17 @@ def test_an_observation_without_words_leaves_without_a_contract(tmp_path: Path) 
     done = export(path, tmp_path / "policy.onnx")
     assert done.contract is None
     assert "'camera', which is no word of a contract" in done.why
-    assert not (tmp_path / "contract.json").exists()
+    beside = tmp_path / "contract.json"
+    assert not beside.exists()
+    export(asset_path("policies", "biped.npz"), tmp_path / "policy.onnx")
+    before = {file: file.read_bytes() for file in tmp_path.iterdir()}
+    with pytest.raises(
+        files.FileError, match=r"contract\.json is there and is not the contract of"
+    ):
+        export(path, tmp_path / "policy.onnx")
+    assert {file: file.read_bytes() for file in tmp_path.iterdir()} == before
+    assert export(path, tmp_path / "policy.onnx", overwrite=True).contract is None
+    assert not beside.exists()
 
 
 def test_nothing_of_others_is_replaced(tmp_path: Path) -> None:

@@ -178,6 +178,10 @@ def test_a_policy_file_is_scored_by_its_own_options(
     assert config_of(path, "stand").options.height_of == "root"
     foreign = config_of(path, "biped")  # in another task the paper's options of that task
     assert foreign.options == make_config("biped").options
+    assert foreign.robot == "a1"
+    lost = save(tmp_path / "lost.npz", robot="lost.py:GO1")  # it is not shown on the A1 instead
+    with pytest.raises(PolicyFileError, match=r"lost\.npz: .*lost\.py"):
+        config_of(lost, "biped")
 
 
 def test_a_policy_file_of_an_unknown_task_is_named(tmp_path: Path) -> None:

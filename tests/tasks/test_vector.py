@@ -321,11 +321,21 @@ def test_pictures_show_goal_and_bands(worlds: Callable[..., Any]) -> None:
         pytest.skip(f"no headless OpenGL on this machine: {error}")
     hurdles = worlds("hurdles", num_envs=2)
     state = hurdles.reset(0)
-    task = state.world.task
+    near = state.world.task.positions - state.world.task.positions[:, :1] + 0.6
+    task = state.world.task._replace(positions=near)  # the first is in view
+    state = state.replace(world=state.world.replace(task=task))
     far = state.replace(
         world=state.world.replace(task=task._replace(positions=task.positions + 50.0))
     )
-    shown, bare = hurdles.env.render(state, 1), hurdles.env.render(far, 1)
+    orange = []
+    for aside in (0.0, 16.0):  # m; bands have no end across, and bumpy ground is used all over
+        moved = state.data.qpos.at[:, 1].add(aside)
+        shown, bare = (
+            hurdles.env.render(s.replace(data=s.data.replace(qpos=moved)), 1).astype(int)
+            for s in (state, far)
+        )
+        assert shown.shape == (480, 640, 3)
+        share = [(image[..., 0] > image[..., 2] + 100).mean() for image in (shown, bare)]
+        orange.append(share[0] - share[1])
+    assert orange[0] > 0.002 and orange[1] == pytest.approx(orange[0], rel=0.1)
     hurdles.env.painter.close()
-    assert shown.shape == (480, 640, 3)
-    assert (np.abs(shown.astype(int) - bare).max(axis=2) > 20).mean() > 0.002

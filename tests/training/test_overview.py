@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from twirl_mjx.commands import runs as command
-from twirl_mjx.commands.selection import the_one
+from twirl_mjx.commands.selection import selected, the_one
 from twirl_mjx.machine import try_lock
 from twirl_mjx.training import overview
 
@@ -142,6 +142,13 @@ def test_where_one_policy_is_meant(tmp_path: Path) -> None:
     assert the_one("trot", tmp_path) == "trot"  # a controller of that name goes before
     assert the_one("name:trot", tmp_path) == path
     assert the_one("nothing", tmp_path) == "nothing"  # the command says what it could be
+    assert the_one("mine=bipeds", tmp_path) == f"mine={tmp_path / 'bipeds'}"
+    assert the_one("mine=trot", tmp_path) == "mine=trot"
+    named = ["old=name:trot", "new=bipeds", "zero=zero"]
+    paths = (f"old={path}", f"new={tmp_path / 'bipeds'}", "zero=zero")
+    assert selected(named, tmp_path) == paths
+    with pytest.raises(ValueError, match=r"'\*' selects 2 runs, expected one"):
+        the_one("mine=*", tmp_path)
     with pytest.raises(ValueError, match=r"'\*' selects 2 runs, expected one: bipeds, trot"):
         the_one("*", tmp_path)
 

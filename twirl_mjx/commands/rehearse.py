@@ -204,28 +204,15 @@ def write(path: Path, policy: str, result: Rehearsal) -> None:
 
 def film(path: Path, result: Rehearsal) -> tuple[Path, Path]:
     """Film the first episode; return the paths of film and strip."""
-    import numpy as np
-
+    from twirl_mjx.deploy.ground import build_model
     from twirl_mjx.deploy.render import render_episode
-    from twirl_mjx.evaluation.record import Recording, scene_model
     from twirl_mjx.sim.robots import A1
     from twirl_mjx.tasks.registry import TASKS
-    from twirl_mjx.worlds.config import WorldConfig
 
     episode, kind = result.episodes[0], TASKS.get(result.task)
     count = len(episode.qpos)
-    bands = tuple(map(float, episode.hurdles[episode.hurdles < episode.qpos[:, 0].max() + 4.0]))
-    recording = Recording(
-        episode.qpos,
-        np.zeros((count, 3)),
-        np.zeros(count),
-        {},
-        bands,
-        np.ones(4),
-        A1,
-        result.config.hurdle_height,
-    )
-    model = scene_model(WorldConfig(task=result.task, options=kind.paper_options()), recording)
+    bands = episode.hurdles[episode.hurdles < episode.qpos[:, 0].max() + 4.0]
+    model = build_model(result.config, bands)  # the ground that was rehearsed
     captions = [[f"{result.task}, rehearsal  {A1.control_dt * i:5.2f} s"] for i in range(count)]
     return render_episode(
         model,

@@ -16,7 +16,7 @@ from twirl_mjx.checks import check_range
 from twirl_mjx.commands.console import say
 from twirl_mjx.commands.selection import the_one
 from twirl_mjx.plugins import is_reference
-from twirl_mjx.policies.learned import BEST_POLICY, LAST_POLICY
+from twirl_mjx.policies.learned import BEST_POLICY, LAST_POLICY, PolicyFileError
 
 if TYPE_CHECKING:
     from twirl_mjx.evaluation.record import Recording
@@ -175,7 +175,7 @@ def config_of(policy: str, task: str | None) -> WorldConfig:
         PolicyFileError: The file is no policy, or of a task or with options unknown here.
         ValueError: The policy does not say its task and none is given.
     """
-    from twirl_mjx.policies.resolve import config_of_card, header_of
+    from twirl_mjx.policies.resolve import config_of_card, header_of, robot_of_card
     from twirl_mjx.tasks.registry import TASKS
     from twirl_mjx.training.rundir import RunDir
     from twirl_mjx.worlds.config import WorldConfig, in_task
@@ -191,7 +191,11 @@ def config_of(policy: str, task: str | None) -> WorldConfig:
         return config_of_card(header, policy)
     if name is None:
         raise ValueError(f"{policy} does not say its task: give --task")
-    return WorldConfig(task=name, options=TASKS.get(name).paper_options())
+    own = {} if header is None else {"robot": robot_of_card(header)}
+    try:
+        return WorldConfig(task=name, options=TASKS.get(name).paper_options(), **own)
+    except ValueError as error:
+        raise PolicyFileError(f"{policy}: {error}") from error
 
 
 def name_of(policy: str) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -11,6 +12,14 @@ RUNS = Path("runs")
 """Folder of all runs of commands without an option for it."""
 
 
+def split_name(word: str) -> tuple[str, str]:
+    """Return name and policy of NAME=POLICY; the name is empty where none is given."""
+    name, equals, given = word.partition("=")
+    if equals and re.fullmatch(r"[\w+-]+", name) and not Path(word).exists():
+        return name, given
+    return "", word
+
+
 def selected(words: Sequence[str], runs: Path = RUNS) -> tuple[str, ...]:
     """Return policies with what selects runs replaced by the paths of these; see ``overview``.
 
@@ -18,6 +27,8 @@ def selected(words: Sequence[str], runs: Path = RUNS) -> tuple[str, ...]:
         FileNotFoundError: Conditions, and no run that fits.
         ValueError: A condition on what no run has.
     """
+    pairs = map(split_name, words)
+    words = tuple(f"{name}={the_one(given, runs)}" if name else given for name, given in pairs)
     found = tuple(expand(words, runs))
     if found == tuple(words):
         return found

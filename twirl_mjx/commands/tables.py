@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from pathlib import Path
 
 from twirl_mjx import files
 from twirl_mjx.checks import check_printable
+from twirl_mjx.commands.selection import split_name
 
 
 def results_folder() -> Path:
@@ -23,8 +23,8 @@ def named(word: str) -> tuple[str, str]:
     """
     from twirl_mjx.commands.render import name_of
 
-    name, equals, given = word.partition("=")
-    if equals and re.fullmatch(r"[\w+-]+", name) and not Path(word).exists():
+    name, given = split_name(word)
+    if name:
         return name, given
     check_printable("the name of policy", found := name_of(word))
     return found, word

@@ -179,13 +179,16 @@ def _write(options: ViewOptions, path: Path) -> Path:
         return _write_clip(options, path)
     if _is_trace(Path(name)):
         return _write_trace(options, path)
-    from twirl_mjx.policies.resolve import header_of
+    from twirl_mjx.policies.resolve import header_of, robot_of_card
+    from twirl_mjx.sim.robots import A1
 
-    header = None if options.task else header_of(name)
+    header = header_of(name)
     task = options.task or (header.task if header else None)
-    if task in TASKS and options.shift in SHIFTS:
+    robot = robot_of_card(header) if header else A1.name
+    if task in TASKS and options.shift in SHIFTS and robot == A1.name:
         return _write_rehearsal(options, path)
-    say(f"{name}: task {task} under {options.shift} is not rehearsed, so its worlds are compiled")
+    what = f"task {task} under {options.shift}" if robot == A1.name else f"robot {robot}"
+    say(f"{name}: {what} is not rehearsed, so its worlds are compiled")
     return _write_recording(options, path)
 
 

@@ -159,6 +159,9 @@ def export(
     try:
         contract = contract_of(loaded.header, robot)
     except ContractError as error:
+        _check_beside(beside, None, overwrite)
+        if beside.exists():  # it would be taken for that of the new graph
+            beside.unlink()
         return Exported(export_onnx(loaded, out), None, str(error))
     _check_beside(beside, contract, overwrite)
     written = export_onnx(loaded, out, contract)
@@ -166,8 +169,8 @@ def export(
     return Exported(written, beside, "")
 
 
-def _check_beside(path: Path, contract: Contract, overwrite: bool) -> None:
-    """Refuse to replace the contract of another policy."""
+def _check_beside(path: Path, contract: Contract | None, overwrite: bool) -> None:
+    """Refuse to replace the contract of another policy; None: this one has none."""
     files.check_target(path)
     if overwrite or not path.exists():
         return
@@ -178,7 +181,8 @@ def _check_beside(path: Path, contract: Contract, overwrite: bool) -> None:
     if not is_same:
         raise files.FileError(
             f"{path} is there and is not the contract of this policy; nothing was touched (nearest:"
-            f" --out {path.parent / contract.name / 'policy.onnx'}, or --overwrite to replace it)"
+            f" --out {path.parent / (contract.name if contract else 'mine') / 'policy.onnx'}, or"
+            " --overwrite to replace it)"
         )
 
 

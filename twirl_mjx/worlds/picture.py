@@ -14,6 +14,8 @@ from twirl_mjx.sim.scene import Bands, Scene, build_scene
 
 FRAME_SIZE = (640, 480)
 """Width and height in pixels."""
+LANE = 2.0
+"""m, bands have no end across; those that are drawn are centred on a multiple of this."""
 BANDS_AHEAD = 4.0
 """m, bands are drawn up to this far beyond the robot."""
 
@@ -33,7 +35,7 @@ class Painter:
         self._band_height = band_height
         self._dynamics = dynamics
         self._view = CameraView()
-        self._opened: tuple[tuple[float, ...], SceneRenderer] | None = None
+        self._opened: tuple[tuple[tuple[float, ...], float], SceneRenderer] | None = None
 
     def draw(
         self, qpos: np.ndarray, bands: np.ndarray | None = None, goal: np.ndarray | None = None
@@ -50,7 +52,8 @@ class Painter:
         """
         near = () if bands is None else tuple(map(float, bands[bands < qpos[0] + BANDS_AHEAD]))
         look_at = np.array([qpos[0], qpos[1], max(self._view.height, 0.6 * qpos[2])])
-        return self._open(near).draw(qpos, self._view, look_at, goal)
+        lane = LANE * round(float(qpos[1]) / LANE)
+        return self._open(near, lane).draw(qpos, self._view, look_at, goal)
 
     def close(self) -> None:
         """Free the OpenGL context; the next picture opens another."""
@@ -58,17 +61,18 @@ class Painter:
             self._opened[1].close()
             self._opened = None
 
-    def _open(self, bands: tuple[float, ...]) -> SceneRenderer:
-        if self._opened is None or self._opened[0] != bands:
+    def _open(self, bands: tuple[float, ...], lane: float) -> SceneRenderer:
+        if self._opened is None or self._opened[0] != (bands, lane):
             self.close()
-            self._opened = bands, SceneRenderer(self._model(bands), *FRAME_SIZE)
+            self._opened = (bands, lane), SceneRenderer(self._model(bands, lane), *FRAME_SIZE)
         return self._opened[1]
 
-    def _model(self, bands: tuple[float, ...]) -> mujoco.MjModel:
+    def _model(self, bands: tuple[float, ...], lane: float) -> mujoco.MjModel:
         scene, dynamics = self._scene, self._dynamics
         if bands:
             drawn = Bands(
                 bands,
+                y=lane,
                 height=self._band_height,
                 incline=float(dynamics.incline),
                 bump_height=float(dynamics.bump_height),
