@@ -191,9 +191,9 @@ def config_of(policy: str, task: str | None) -> WorldConfig:
         return config_of_card(header, policy)
     if name is None:
         raise ValueError(f"{policy} does not say its task: give --task")
-    own = {} if header is None else {"robot": robot_of_card(header)}
+    robot = WorldConfig.robot if header is None else robot_of_card(header)
     try:
-        return WorldConfig(task=name, options=TASKS.get(name).paper_options(), **own)
+        return WorldConfig(task=name, options=TASKS.get(name).paper_options(), robot=robot)
     except ValueError as error:
         raise PolicyFileError(f"{policy}: {error}") from error
 
