@@ -40,12 +40,6 @@ def done(tmp_path: Path) -> RunDir:
     return run_dir
 
 
-@pytest.fixture
-def checkpointed(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Whatever the run, it has a checkpoint to go on from."""
-    monkeypatch.setattr(rundir, "has_checkpoint", lambda path: True)
-
-
 def change(run_dir: RunDir, edit: Callable[[list[list[str]]], object]) -> None:
     """Edit the rows of ``eval.csv`` in place, the header first."""
     with run_dir.episodes.open(newline="") as file:
@@ -94,7 +88,6 @@ def test_a_whole_run_is_finished(done: RunDir) -> None:
     assert done.status(CONFIG) == found
 
 
-@pytest.mark.usefixtures("checkpointed")
 @pytest.mark.parametrize("damage", DAMAGE)
 def test_a_damaged_evaluation_does_not_finish_a_run(damage: str, done: RunDir) -> None:
     edit, message = DAMAGE[damage]
@@ -117,11 +110,11 @@ def test_the_remedy_helps(done: RunDir) -> None:
 
 def test_a_pruned_run_is_not_trained_anew(done: RunDir) -> None:
     """Its policy would be lost; so the message does not say that deleting helps."""
+    done.policy.write_bytes(b"p")
     change(done, halve)
     with pytest.raises(ValueError, match=r"checkpoints are gone; `twirl evaluate` judges its poli"):
         done.finished()
     done.episodes.unlink()
-    done.policy.write_bytes(b"p")
     status = done.status(CONFIG)
     assert isinstance(status, Foreign)
     assert "would be trained anew; nothing was touched" in str(status.error)

@@ -190,7 +190,7 @@ def test_the_option_height_decides_what_is_a_touch() -> None:
 
 def test_pictures_show_bands_as_high_as_they_are() -> None:
     config = WorldConfig(task="hurdles", options=HurdlesOptions(height=0.05))
-    painted = make_env(config, num_envs=1).painter._model((2.0,)).geom("hurdle_0")
+    painted = make_env(config, num_envs=1).painter._model((2.0,), 0.0).geom("hurdle_0")
     assert 2 * painted.size[2] == pytest.approx(0.05)
     recording = Recording(
         np.zeros((1, 19)), np.zeros((1, 3)), np.zeros(1), {}, (2.0,), np.ones(4), A1, 0.1

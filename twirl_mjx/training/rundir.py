@@ -212,7 +212,8 @@ class RunDir:
                 " gone, so it cannot go on; nothing was touched. Give another --name; its policy"
                 f" can start that run: --variant weights --source {self.policy}"
             ))  # fmt: skip
-        if done is None and self.sums.exists() and budget and not has_checkpoint(self.path):
+        lost = done is None and self.sums.exists() and not has_checkpoint(self.path)
+        if lost and budget and self.policy.exists():
             return Foreign(RunMismatchError(
                 f"{self} was finished, and its evaluation and its checkpoints are gone, so it would"
                 " be trained anew; nothing was touched. Give another --name; `twirl evaluate"
@@ -263,10 +264,10 @@ class RunDir:
         if not self.episodes.is_file():
             return None
         what = "the evaluation of a run"
-        config = self.read_config()
-        can_close = config.variant == "zero-shot" or has_checkpoint(self.path)
-        remedy = EVALUATE_AGAIN if can_close else f"{JUDGE_POLICY} {self.policy.name}"
+        loses = self.policy.exists() and not has_checkpoint(self.path)  # by training anew
+        remedy = f"{JUDGE_POLICY} {self.policy.name}" if loses else EVALUATE_AGAIN
         rows = files.read_rows(self.episodes, what, EVAL_CELLS, remedy=remedy)
+        config = self.read_config()
         if fault := self._fault_of(rows, config):
             raise files.FileError(f"{self.episodes}: {fault}; {remedy}")
         values: dict[str, list[float]] = {}
