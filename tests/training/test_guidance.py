@@ -119,9 +119,9 @@ def fresh(config: TrainConfig, guide: Guide | None) -> Any:
     return make(jax.random.key(0))
 
 
-def run_probe(kind: str, epochs: int) -> tuple[Any, list[dict[str, float]]]:
+def run_probe(epochs: int) -> tuple[Any, list[dict[str, float]]]:
     """Train beside a source that does the best; return the last state and metrics by epoch."""
-    config, env = probe_config(kind), PROBE
+    config, env = probe_config("best-of"), PROBE
     guide = Guide(config, Constant(BEST))
     epoch = state.compile_epoch(config, env, guide)
     now, told = fresh(config, guide), []
@@ -132,7 +132,7 @@ def run_probe(kind: str, epochs: int) -> tuple[Any, list[dict[str, float]]]:
 
 
 def test_the_critic_takes_a_good_source_and_leaves_a_bad_one() -> None:
-    now, told = run_probe("best-of", 2)
+    now, told = run_probe(2)
     assert int(now.guide.memory[0]) == 400  # asked at every step: 2 epochs of 1600 / 8
     assert told[-1]["guided"] > 0.6
     assert told[-1]["reward"] > 0.9
@@ -148,17 +148,6 @@ def test_the_critic_takes_a_good_source_and_leaves_a_bad_one() -> None:
         assert (float(after.share) > share) is (action == BEST)
 
 
-def test_the_horizon_shrinks_to_nothing_beside_a_source_that_can_be_reached() -> None:
-    now, told = run_probe("jump-start", 4)
-    horizons = [each["guide_horizon"] for each in told]
-    assert horizons[0] > horizons[-1]
-    assert (np.diff(horizons) <= 0.0).all()
-    assert float(now.guide.best) == pytest.approx(LENGTH, abs=0.01)  # the source's own return
-    # The source acts in h of the 10 steps of an episode; h is noted after the step.
-    shares = [each["guided"] for each in told]
-    np.testing.assert_allclose(shares, np.array(horizons) / LENGTH, atol=0.05)
-
-
 def test_without_a_guide_nothing_is_kept_or_logged() -> None:
     config, env = probe_config("none"), PROBE
     first = jax.eval_shape(lambda: fresh(config, None))
@@ -167,25 +156,16 @@ def test_without_a_guide_nothing_is_kept_or_logged() -> None:
         first,
     )
     assert first.guide == after.guide == ()
-    assert not {"guided", "guide_horizon"} & metrics.keys()
+    assert "guided" not in metrics
 
 
-def ask(kind: str, steps: list[int], source: float, values: Any, env_steps: int = 1000) -> Any:
+def ask(source: float, values: Any, env_steps: int = 1000) -> Any:
     """Return the state and the actions of one step; the learner's own action is 0.1."""
-    guide = Guide(probe_config(kind), Constant(source))
-    env: Any = SimpleNamespace(
-        obs=jnp.ones((WORLDS, 2)), world=Clock(jnp.array([*steps, *[99] * (WORLDS - len(steps))]))
-    )
+    guide = Guide(probe_config("best-of"), Constant(source))
+    env: Any = SimpleNamespace(obs=jnp.ones((WORLDS, 2)))
     own = jnp.full((WORLDS, 2), 0.1)
     count = jnp.asarray(env_steps)
     return guide.choose(guide.init(env), env, count, own, values, jax.random.key(0))
-
-
-def test_jump_start_acts_before_the_horizon_only() -> None:
-    now, action = ask("jump-start", [0, 9, 10], 0.5, None)
-    np.testing.assert_allclose(action[:4, 0], [0.5, 0.5, 0.1, 0.1])
-    assert float(now.share) == pytest.approx(2 / 8)
-    np.testing.assert_array_equal(now.memory, 1)  # it is asked in every world
 
 
 def test_best_of_takes_the_action_of_the_higher_value() -> None:
@@ -194,30 +174,12 @@ def test_best_of_takes_the_action_of_the_higher_value() -> None:
     def value(action: jax.Array) -> jax.Array:
         return wants * action[:, 0]
 
-    _, action = ask("best-of", [], 0.5, value)
+    _, action = ask(0.5, value)
     np.testing.assert_allclose(action[:4, 0], [0.5, 0.1, 0.1, 0.1])  # no better: its own
-    _, action = ask("best-of", [], 3.0, value)
+    _, action = ask(3.0, value)
     assert float(action[0, 0]) == 1.0  # clipped, as the worlds would
-    _, action = ask("best-of", [], 0.5, value, env_steps=160)
+    _, action = ask(0.5, value, env_steps=160)
     np.testing.assert_allclose(action, 0.1, rtol=1e-6)  # the critic has not been updated yet
-
-
-def test_the_horizon_by_hand() -> None:
-    guide = Guide(probe_config("jump-start"), Constant(0.0))
-    env: Any = SimpleNamespace(obs=jnp.ones((WORLDS, 2)))
-    now, seen = guide.init(env), []
-    # (sum of returns, episodes): windows of 20 with means 10, 9, 9.6, 12, 11.3
-    for returns, episodes in [
-        (100.0, 10), (100.0, 10), (180.0, 20), (192.0, 20), (240.0, 20), (226.0, 20)
-    ]:  # fmt: skip
-        now, told = guide.note(now, jnp.float32(returns), jnp.float32(episodes))
-        seen.append(int(told["guide_horizon"]))
-    # Nothing after 10 episodes; the first mean is the best; 9 < 9.5; 9.6; 12; 11.3 < 11.4.
-    assert seen == [10, 9, 9, 8, 7, 7]
-    assert float(now.best) == 12.0
-    for _ in range(20):
-        now, told = guide.note(now, jnp.float32(240.0), jnp.float32(20.0))
-    assert int(told["guide_horizon"]) == 0
 
 
 def test_the_value_is_the_least_of_the_target_critics() -> None:
@@ -265,15 +227,18 @@ def test_guides_that_cannot_work_are_refused(monkeypatch: pytest.MonkeyPatch) ->
         loop.guide_of([Part(guided, RunDir("x"), policy=Constant(i)) for i in range(2)])
     plain = dataclasses.replace(learner_of(config.droq), value=None)
     monkeypatch.setattr(source_rules, "learner_of", lambda settings: plain)
-    with pytest.raises(ValueError, match=r"learner droq has no value \(nearest: guide jump-start"):
+    with pytest.raises(ValueError, match=r"learner droq has no value \(nearest: guide none"):
         source_rules.check_guide(dataclasses.replace(guided, source="trot"), None)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("guide", ["jump-start", "best-of"])
-def test_a_guided_run_resumes_bit_for_bit(guide: str, tmp_path: Path) -> None:
+def test_a_guided_run_resumes_bit_for_bit(tmp_path: Path) -> None:
     config = dataclasses.replace(
-        make_config("stand", "debug"), variant="twirl", guide=guide, source="trot", engine="native"
+        make_config("stand", "debug"),
+        variant="twirl",
+        guide="best-of",
+        source="trot",
+        engine="native",
     )
 
     def train(config: TrainConfig, name: str) -> Any:
@@ -295,4 +260,4 @@ def test_a_guided_run_resumes_bit_for_bit(guide: str, tmp_path: Path) -> None:
     with (tmp_path / "parts" / "metrics.csv").open(newline="") as file:
         shares = [float(r["value"]) for r in csv.DictReader(file) if r["metric"] == "guided"]
     assert len(shares) == 3
-    assert shares[0] == (1.0 if guide == "jump-start" else 0.0)
+    assert shares[0] == 0.0 and shares[-1] > 0.0

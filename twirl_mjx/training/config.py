@@ -17,7 +17,7 @@ from twirl_mjx.worlds.config import WorldConfig, world_fields
 
 Variant = Literal["scratch", "twirl", "twirl+weights", "weights", "zero-shot"]
 Keep = Literal["best", "last"]
-Guidance = Literal["none", "jump-start", "best-of"]
+Guidance = Literal["none", "best-of"]
 VARIANTS: tuple[Variant, ...] = ("scratch", "twirl", "twirl+weights", "weights", "zero-shot")
 INT32_MAX = 2**31 - 1
 """Transitions and critic updates are counted on the device, in int32."""
@@ -64,8 +64,7 @@ class TrainConfig(WorldConfig):
     """auto (shipped policy, else train it), train, trot, bound, zero, random, clip, a run, a policy
     file (.npz, .onnx), recorded data (.npz) or file.py:function of your own."""
     guide: Guidance = "none"
-    """Let the source act too: in the first steps of an episode, ever fewer (jump-start), or where
-    the critic values its action higher (best-of)."""
+    """Let the source act too, where the critic values its action higher (best-of)."""
     source_contract: str = ""
     """How a foreign source meets the robot: go1_joystick, legged_gym_48, legged_gym_45, ... or a
     JSON file (docs/sources.md); by default what the file itself says."""

@@ -28,9 +28,6 @@ METRICS: dict[str, MetricInfo] = {
     ),
     # With --guide only.
     "guided": MetricInfo("share of transitions in which the source acted", "share"),
-    "guide_horizon": MetricInfo(
-        "steps of an episode in which the source acts (jump-start)", "control steps"
-    ),
     # Bookkeeping.
     "env_steps_per_s": MetricInfo(
         "transitions per second; undefined for an epoch with a compilation", "1/s"

@@ -127,10 +127,10 @@ def check_guide(config: TrainConfig, source: Source | None) -> None:
         )
     if source is None:
         check_acts(config.source)
-    if config.guide == "best-of" and (learner := learner_of(config.droq)).value is None:
+    if (learner := learner_of(config.droq)).value is None:
         raise ValueError(
-            f"guide best-of asks the critic, and learner {learner.name} has no value (nearest:"
-            " guide jump-start)"
+            f"guide {config.guide} asks the critic, and learner {learner.name} has no value"
+            " (nearest: guide none)"
         )
 
 

@@ -119,9 +119,8 @@ def collect_step(
         warm = jax.random.uniform(warm_key, action.shape, minval=-1.0, maxval=1.0)
         action = jnp.where(state.env_steps < config.warmup_env_steps, warm, action)
     if guide is not None:
-        value = learner.value and functools.partial(
-            learner.value, state.learner, config.droq, state.env.obs
-        )
+        assert learner.value is not None, "refused before (source_rules.check_guide)"
+        value = functools.partial(learner.value, state.learner, config.droq, state.env.obs)
         guide_key = jax.random.fold_in(key, GUIDE)
         noted, action = guide.choose(
             state.guide, state.env, state.env_steps, action, value, guide_key
@@ -208,8 +207,7 @@ def train_step(
         FIRST_DROP: jnp.max(fault).astype(jnp.float32),
     }
     if guide is not None:
-        noted, told = guide.note(state.guide, finished.values["return"], finished.count)
-        state, worlds = state.replace(guide=noted), worlds | told
+        worlds["guided"] = state.guide.share
     return state.replace(learner=learner), (learner_metrics, worlds, finished)
 
 
