@@ -262,28 +262,11 @@ def test_a_task_may_not_be_called_like_a_part_of_the_config(tmp_path: Path) -> N
 
 @pytest.mark.slow
 def test_a_source_object_from_python(tmp_path: Path) -> None:
-
-    result = twirl_mjx.train(
-        "stand",
-        preset="debug",
-        source=get_scripted("trot"),
-        variant="twirl",
-        runs=tmp_path,
-        name="mine",
-        total_env_steps=64,
-        droq={"utd": 1.0},
-        say=lambda _: None,
-    )
-    assert result.directory == tmp_path / "mine"
-    source = RunDir(result.directory).read_source()
-    assert source == {"origin": "object GaitPolicy", "digest": digest_of(get_scripted("trot"))}
-    with pytest.raises(
-        RunMismatchError, match=r"source digest: '.*GaitPolicy .* -> '.*GaitPolicy "
-    ):
-        twirl_mjx.train(
+    def train(source: str) -> Any:
+        return twirl_mjx.train(
             "stand",
             preset="debug",
-            source=get_scripted("bound"),
+            source=get_scripted(source),
             variant="twirl",
             runs=tmp_path,
             name="mine",
@@ -291,6 +274,13 @@ def test_a_source_object_from_python(tmp_path: Path) -> None:
             droq={"utd": 1.0},
             say=lambda _: None,
         )
+
+    result = train("trot")
+    assert result.directory == tmp_path / "mine"
+    source = RunDir(result.directory).read_source()
+    assert source == {"origin": "object GaitPolicy", "digest": digest_of(get_scripted("trot"))}
+    with pytest.raises(RunMismatchError, match=r"source digest: '.*GaitPolicy .* -> '.*Policy "):
+        train("bound")
     steps, values = result.curves["source_rows"]
     assert steps.tolist() == [32.0, 64.0]
     assert values.tolist() == [64.0, 64.0]

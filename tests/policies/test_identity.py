@@ -79,6 +79,16 @@ def test_equal_objects_have_the_same_digest() -> None:
     assert digest_of(get_scripted("trot")).startswith("twirl_mjx.policies.scripted.GaitPolicy ")
 
 
+def test_what_a_dataclass_caches_is_none_of_it() -> None:
+    trot: Any = get_scripted("trot")
+    before = digest_of(trot)
+    vars(trot.robot)["found_later"] = 1
+    try:
+        assert digest_of(trot) == before
+    finally:
+        del vars(trot.robot)["found_later"]
+
+
 def test_objects_that_hold_themselves_end() -> None:
     mine = Mine(1.0)
     mine.other = [mine]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import functools
 import hashlib
 import pickle
@@ -21,9 +22,9 @@ Put = Callable[[bytes], object]
 def digest_of(thing: Any) -> str:
     """Return the class of an object and a digest of what decides what it does.
 
-    That is what its attributes hold, all the way down: numbers, text, arrays, and the code,
-    defaults and closures of functions. Not looked into: what functions call by a global name, and
-    objects of C extensions that cannot be pickled.
+    That is what its attributes hold (of a dataclass its fields, not what it caches), all the way
+    down: numbers, text, arrays, and the code, defaults and closures of functions. Not looked into:
+    what functions call by a global name, and objects of C extensions that cannot be pickled.
     """
     found = hashlib.sha256()
     _feed(thing, found.update, ())
@@ -76,6 +77,8 @@ def _parts(thing: Any) -> list[Any]:
             return [thing.func, thing.args, thing.keywords]
     if (wrapped := getattr(thing, "__wrapped__", None)) is not None:
         return [wrapped]
+    if dataclasses.is_dataclass(thing):
+        return [{field.name: getattr(thing, field.name) for field in dataclasses.fields(thing)}]
     slots = [name for kind in type(thing).__mro__ for name in getattr(kind, "__slots__", ())]
     held = {name: getattr(thing, name) for name in slots if hasattr(thing, name)}
     held |= getattr(thing, "__dict__", {})
