@@ -79,6 +79,21 @@ def test_equal_objects_have_the_same_digest() -> None:
     assert digest_of(get_scripted("trot")).startswith("twirl_mjx.policies.scripted.GaitPolicy ")
 
 
+def test_cached_properties_are_none_of_it() -> None:
+    class Lazy:
+        def __init__(self, gain: float) -> None:
+            self.gain = gain
+
+        @functools.cached_property
+        def table(self) -> list[float]:
+            return [self.gain]
+
+    lazy = Lazy(1.0)
+    before = digest_of(lazy)
+    assert lazy.table == [1.0]
+    assert digest_of(lazy) == before != digest_of(Lazy(2.0))
+
+
 def test_what_a_dataclass_caches_is_none_of_it() -> None:
     trot: Any = get_scripted("trot")
     before = digest_of(trot)

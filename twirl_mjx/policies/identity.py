@@ -22,7 +22,7 @@ Put = Callable[[bytes], object]
 def digest_of(thing: Any) -> str:
     """Return the class of an object and a digest of what decides what it does.
 
-    That is what its attributes hold (of a dataclass its fields, not what it caches), all the way
+    That is what its attributes hold (of a dataclass its fields; no cached properties), all the way
     down: numbers, text, arrays, and the code, defaults and closures of functions. Not looked into:
     what functions call by a global name, and objects of C extensions that cannot be pickled.
     """
@@ -81,8 +81,14 @@ def _parts(thing: Any) -> list[Any]:
         return [{field.name: getattr(thing, field.name) for field in dataclasses.fields(thing)}]
     slots = [name for kind in type(thing).__mro__ for name in getattr(kind, "__slots__", ())]
     held = {name: getattr(thing, name) for name in slots if hasattr(thing, name)}
-    held |= getattr(thing, "__dict__", {})
+    own = getattr(thing, "__dict__", {})
+    held |= {name: value for name, value in own.items() if not _is_cached(thing, name)}
     return [held] if held else _frozen(thing)
+
+
+def _is_cached(thing: Any, name: str) -> bool:
+    """Return whether an attribute follows from the others and was found when it was asked for."""
+    return isinstance(getattr(type(thing), name, None), functools.cached_property)
 
 
 def _frozen(thing: Any) -> list[bytes]:
