@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import dataclasses
 import json
 from pathlib import Path
 
@@ -12,7 +13,9 @@ import pytest
 from twirl_mjx import files
 from twirl_mjx.assets import asset_path
 from twirl_mjx.commands import rehearse as command
+from twirl_mjx.deploy import render
 from twirl_mjx.deploy.conditions import RehearsalConfig
+from twirl_mjx.deploy.ground import build_model
 from twirl_mjx.deploy.rehearsal import rehearse
 from twirl_mjx.policies.scripted import TROT, action_table
 from twirl_mjx.sim.robots import A1
@@ -115,6 +118,23 @@ def test_a_film_of_the_first_episode(tmp_path: Path) -> None:
     assert run(*words) == 0
     files.check_ours(film)
     files.check_ours(film.with_suffix(".png"))
+
+
+def test_a_film_shows_the_ground_that_was_rehearsed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shown = []
+    monkeypatch.setattr(render, "render_episode", lambda model, *_, **__: shown.append(model))
+    conditions = RehearsalConfig(incline_deg=8.0, episode_s=0.2)
+    flat = dataclasses.replace(conditions, incline_deg=0.0)
+    for config in (conditions, flat):
+        result = rehearse("zero", task="hurdles", episodes=1, config=config)
+        command.film(tmp_path / "a.mp4", result)
+        rehearsed = build_model(config, result.episodes[0].hurdles)
+        ground = [model.geom_bodyid == 0 for model in (rehearsed, shown[-1])]
+        assert shown[-1].geom("hurdle_0").pos == pytest.approx(rehearsed.geom("hurdle_0").pos)
+        assert shown[-1].geom_quat[ground[1]][0] == pytest.approx(rehearsed.geom_quat[ground[0]][0])
+    assert shown[0].geom("hurdle_0").quat[2] != 0.0 and shown[1].geom("hurdle_0").quat[2] == 0.0
 
 
 def test_recorded_data_do_not_act(tmp_path: Path) -> None:

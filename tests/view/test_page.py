@@ -15,8 +15,10 @@ import numpy as np
 import pytest
 
 from twirl_mjx import cli
+from twirl_mjx.commands import view
 from twirl_mjx.deploy.conditions import RehearsalConfig
 from twirl_mjx.deploy.ground import build_model
+from twirl_mjx.policies.learned import PolicyHeader, save_policy
 from twirl_mjx.view.page import live_page, write_replay
 from twirl_mjx.view.picture import Picture
 from twirl_mjx.view.server import serving
@@ -185,3 +187,19 @@ def test_places_where_no_page_can_be_served_are_refused(address: str, still: Sta
     ):
         with pytest.raises(ValueError, match=message), serving(still, "", host=host, port=number):
             pass
+
+
+@pytest.mark.parametrize(("robot", "compiled"), [("a1", False), ("go1", True)])
+def test_a_policy_of_another_robot_is_not_rehearsed_but_recorded(
+    robot: str, compiled: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    layer = {"kernel": np.zeros((101, 12)), "bias": np.zeros(12)}
+    header = PolicyHeader("stand", 101, 12, 0.05, card={"robot": robot})
+    path = save_policy(tmp_path / "p.npz", {"mean": layer, "log_std": layer}, header)
+    taken: list[str] = []
+    for name in ("_write_rehearsal", "_write_recording"):
+        monkeypatch.setattr(view, name, lambda *_, name=name: taken.append(name) or tmp_path)
+    for task in ("", "biped"):
+        options = view.ViewOptions(str(path), html=tmp_path / "a.html", task=task or None)
+        view._write(options, tmp_path / "a.html")
+    assert taken == ["_write_recording" if compiled else "_write_rehearsal"] * 2
